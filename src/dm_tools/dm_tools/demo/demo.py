@@ -9,7 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import with_wavelengths
-from dm_tools.demo.demo_bench import Hysteresis, bench_config, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.demo_bench import (
+    Hysteresis,
+    bench_config,
+    identify_hysteresis,
+    new_folder,
+    running_bench,
+    wait_for_calibration,
+)
 from dm_tools.output import (
     WAVELENGTH,
     JsonOption,
@@ -64,12 +71,10 @@ def curvatures_of(capabilities: Any) -> tuple[float, ...]:
 
 def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
-    from dm_common.messages import limits_from
-    from dm_controller.planning.active_calibration import model_of
-    from dm_controller.planning.mirror_model import CalibratedMirror
+    from dm_controller.planning.active_calibration import active_calibration
     from dm_controller.planning.target import FocusTarget
 
-    calibrated = CalibratedMirror(model_of(calibration), limits_from(mirror))
+    calibrated = active_calibration(calibration, mirror).mirror
     return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in ends)
 
 
@@ -116,22 +121,6 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
         f"fitting limit of this mirror at the ends of the sweep: {nanometres(fitting_limit):.1f} nm rms; "
         f"largest coefficient error of the sweep: {with_wavelengths(f'{nanometres(worst):.2f} nm', worst, WAVELENGTH)}"
     )
-
-
-def identify_hysteresis(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
-    """Identify hysteresis and creep, degauss, sweep again; returns the result of the run and the rows."""
-    from dm_msgs.action import Calibrate
-
-    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
-
-    goal = Calibrate.Goal(
-        plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note="demo, hysteresis"
-    )
-    result = run_calibration(client, goal)
-    show_result(result, made_by(client, result))
-    wait_for_calibration(client, result.id)
-    client.degauss()
-    return result, sweep(client, settle)
 
 
 def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -218,8 +207,10 @@ def demo(
             if hysteresis_maps and (hysteresis is not Hysteresis.off or creep):
                 show_sweep(rows, fitting_limit, "influence function alone")
                 console.print("what an influence function cannot know is hysteresis and creep; now they are identified")
-                without_hysteresis = rows
-                identified, rows = identify_hysteresis(client, hysteresis_maps, settle)
+                identified = identify_hysteresis(client, hysteresis_maps, "demo, hysteresis")
+                wait_for_calibration(client, identified.id)
+                client.degauss()
+                without_hysteresis, rows = rows, sweep(client, settle)
                 figures["hysteresis"] = figures_of(identified)
                 figures["focus_without_hysteresis"] = rows_for_json(without_hysteresis)
     show_sweep(

@@ -134,3 +134,15 @@ def wait_for_calibration(client: Any, identifier: str) -> None:
     """Wait until the focus controller uses a calibration. Raises RuntimeError when it does not."""
     if not client.wait(lambda: client.capabilities.calibration_id == identifier):
         raise RuntimeError("the focus controller did not take the new calibration")
+
+
+def identify_hysteresis(client: Any, maps: int, note: str) -> Any:
+    """Calibrate with hysteresis and creep from so many maps, and say what came of it; returns the action's result."""
+    from dm_msgs.action import Calibrate
+
+    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
+
+    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note=note)
+    result = run_calibration(client, goal)
+    show_result(result, made_by(client, result))
+    return result

@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dm_msgs.action import Calibrate
 from rich.table import Table
 
 from dm_autofocus import CameraFocusClient
@@ -14,7 +13,7 @@ from dm_autofocus.sharpness import Region
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.camera_runs import Focused, Recorder, focus_on, follow, sweep_of
-from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.demo_bench import bench_config, identify_hysteresis, new_folder, running_bench, wait_for_calibration
 from dm_tools.demo.pictures import save_animation, save_contact_sheet
 from dm_tools.output import console, next_step, write_json
 from dm_tools.verbs import calibrate
@@ -81,11 +80,7 @@ def demo_camera(law: str, creep: float, seed: int, speed: float, out: Path, json
         config = bench_config(folder, law, creep, seed, speed)
         config["virtual_bench"]["interferometer.pixels"] = PIXELS
         with running_bench(config, folder / "calibration", domain, DeformableMirrorClient) as client:
-            goal = Calibrate.Goal(
-                plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=MAPS, activate=True, note="camera"
-            )
-            calibrated = calibrate.run_calibration(client, goal)
-            calibrate.show_result(calibrated, calibrate.made_by(client, calibrated))
+            calibrated = identify_hysteresis(client, MAPS, "camera")
     shutil.rmtree(folder / "maps")
     # A domain of its own: the first suite's time ran ahead, and nothing of it must be taken for news.
     with own_domain() as domain:
