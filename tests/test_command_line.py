@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import entry_points
@@ -35,7 +34,7 @@ from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.replay import replay
 from dm_tools.verbs.report import folder_with, newest_store
-from dm_tools.verbs.up import end, first_command, lacks, only_suite
+from dm_tools.verbs.up import first_command, lacks, only_suite
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -317,14 +316,6 @@ def test_of_another_bench_the_wiring_comes_first() -> None:
     check = parsed("calibrate", *first_command(False, Path("my_bench.yaml")).split()[1:])
     assert check["plan"] == "poke-check" and check["config"] == Path("my_bench.yaml") and check["write"] is not None
     assert first_command(True, Path("my_bench.yaml")) == "focus 0.02" and first_command(False, None) == "calibrate"
-
-
-def test_up_ends_those_who_wait_before_the_process_does() -> None:
-    stop = threading.Event()
-    waits, never_began = threading.Thread(target=stop.wait), threading.Thread(target=stop.wait)
-    waits.start()
-    end([waits, never_began], stop)
-    assert not waits.is_alive()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,8 +20,6 @@ from dm_tools.output import console, next_step
 
 #: A suite that is not ready after this is said to be late, s.
 LATE_S = 30.0
-#: The longest that the end waits for those who wait for a suite to be ready, s.
-END_S = 10.0
 #: How a line of a node's log looks, unless the user has chosen: with the time of the wall clock.
 LOG_FORMAT = "{date_time_with_ms} {severity} {name}: {message}"
 #: Between the ports of two virtual benches.
@@ -76,17 +74,17 @@ def up(
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
-    watchers = [
-        threading.Thread(target=say_when_ready, args=(name, file, stop), daemon=True)
-        for name, file in itertools.zip_longest(mirrors, config or [])
-    ]
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
         for name, configuration in mirrors.items():
             stack.enter_context(only_suite(name))
             # Else a driver would take the mirror of another bench for its own.
             if taken := taken_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
                 raise RuntimeError(f"virtual_bench: {taken.problem}: {taken.cure}")
-        stack.callback(end, watchers, stop)  # the last of all: the mirrors are safe first
+        # Closed last of all: the mirrors are safe first.
+        watches = [
+            stack.enter_context(contextlib.closing(say_when_ready(name, file)))
+            for name, file in itertools.zip_longest(mirrors, config or [])
+        ]
         folder = logs if logs is not None else Path(temporary)
         suites = []
         for name, configuration in mirrors.items():
@@ -100,11 +98,11 @@ def up(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
         console.print("Ctrl-C stops them and makes every mirror safe")
-        for watcher in watchers if not stop.is_set() else ():
-            watcher.start()
         while not stop.wait(0.2):
             for suite in suites:
                 suite.revive(lambda text: console.print(f"[yellow]{text}[/]"))
+            for watch in watches:
+                next(watch, None)
         console.print("\nstopping")
 
 
@@ -130,14 +128,6 @@ def only_suite(namespace: str) -> Iterator[None]:
         yield
 
 
-def end(watchers: Sequence[threading.Thread], stop: threading.Event) -> None:
-    """End those who wait for a suite to be ready: a process that ends while they ask ROS is aborted."""
-    stop.set()
-    for watcher in watchers:
-        if watcher.is_alive():
-            watcher.join(END_S)
-
-
 def lacks(messages: Mapping[str, Any]) -> str:
     """What keeps a suite that said `messages` (by topic) last from taking requests; "" = nothing."""
     from dm_common.errors import ErrorCode
@@ -155,19 +145,18 @@ def lacks(messages: Mapping[str, Any]) -> str:
     return ""
 
 
-def say_when_ready(namespace: str, file: Path | None, stop: threading.Event) -> None:
-    """Wait until the suite of this namespace, configured by `file`, takes requests; say so and what to do next."""
+def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, None]:
+    """Say when the suite of this namespace, configured by `file`, takes requests, and what to do next; yields till."""
     from dm_client import DeformableMirrorClient
 
     started, late = time.monotonic(), False
     option = f" --namespace {namespace}" if namespace else ""
     with DeformableMirrorClient(namespace) as client:
-        while (lacking := lacks(client.messages)) and not stop.wait(0.2):
+        while lacking := lacks(client.messages):
             if not late and time.monotonic() - started > LATE_S:
                 late = True
                 console.print(f"not ready after {LATE_S:.0f} s: {lacking}; ./dm doctor says more")
-        if stop.is_set():
-            return
+            yield
         capabilities, mirror = client.capabilities, client.mirror_info
     console.print(
         f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, "
