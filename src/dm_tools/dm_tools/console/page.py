@@ -10,8 +10,7 @@ from dm_tools.console.surface_view import SurfaceView
 from dm_tools.console.widgets.actuators import ActuatorCards
 from dm_tools.console.widgets.calibration import CalibrationCard, RecipesCard
 from dm_tools.console.widgets.focus import FocusCard
-from dm_tools.console.widgets.header import Header
-from dm_tools.console.widgets.messages import DiagnosticsCard, LogCard
+from dm_tools.console.widgets.messages import DiagnosticsCard, Header, LogCard
 from dm_tools.console.widgets.surfaces import SurfaceCard, ZernikeCard
 
 #: Only this machine; a web site elsewhere must not reach the mirror through the browser either, hence the host names.

@@ -45,7 +45,7 @@ class Cell:
         number: 1-based.
         x, y: mm, y up.
         signal: normalised; None = nothing commanded yet.
-        fill, ink: colours.
+        fill: colour.
         remarks: flags and grade in words.
         mark: one sign that stands for the first of them, "" = none.
     """
@@ -55,7 +55,6 @@ class Cell:
     y: float
     signal: float | None
     fill: str
-    ink: str
     remarks: tuple[str, ...]
     mark: str
 
@@ -103,7 +102,6 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
                 y=mirror.actuator_y[index] * 1e3,
                 signal=signal,
                 fill=fill,
-                ink=ink_on(fill),
                 remarks=tuple(text for _sign, text in marks),
                 mark=marks[0][0] if marks else "",
             )

@@ -93,9 +93,7 @@ def required_parameters(config: Config) -> Finding | None:
 
 def own_values(config: Config) -> Finding | None:
     unset = [f"{node}.{name}" for node, values in config.items() for name, value in values.items() if value == UNSET]
-    if unset:
-        return Finding(f"still {UNSET}: {', '.join(unset)}", "put in the values of your bench")
-    return None
+    return Finding(f"still {UNSET}: {', '.join(unset)}", "put in the values of your bench") if unset else None
 
 
 def parameters(config: Config) -> Finding | None:

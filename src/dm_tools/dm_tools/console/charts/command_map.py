@@ -12,7 +12,7 @@ from scipy.spatial import HalfspaceIntersection
 
 from dm_calibration.report.document import VERMILION
 from dm_tools.console.charts.plots import INK, Drawing, chart
-from dm_tools.console.view_models import SIGNAL_COLOURS, Cell
+from dm_tools.console.view_models import SIGNAL_COLOURS, Cell, ink_on
 
 #: Distance from the middle to a side of a lone actuator's cell, mm.
 ALONE = 2.0
@@ -49,7 +49,7 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
             "corners": corners.round(3).tolist(),
             "size": size,
             "fill": cell.fill,
-            "ink": cell.ink,
+            "ink": ink_on(cell.fill),
             "edge": VERMILION if cell.number == chosen else "#ffffff",
             "width": 4 if cell.number == chosen else 1.5,
             "label": f"{cell.number} {cell.mark}".strip(),
