@@ -7,7 +7,8 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,6 @@ SPIN_S = 0.1
 IDLE_S = 1.0
 #: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
 MAP_TOPIC = "surface_map"
-
-#: A message, a topic, or () = nothing arrived for a while.
-_Item = tuple[str, bytes, int] | tuple[Topic, str] | tuple[()]
 
 
 class Recorder:
@@ -66,7 +64,7 @@ class Recorder:
         self._wanted = {name if name.startswith("/") else self._namespace + name for name in topics}
         self._maps = maps
         self._bag = BagWriter(folder)
-        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()  # of the writer; None = the end
         self._failure: Exception | None = None
         self._stopping = False
         self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
@@ -103,7 +101,7 @@ class Recorder:
         self._executor.shutdown(1.0)
         self._node.destroy_node()
         self._context.try_shutdown()
-        self._queue.put(None)
+        self._jobs.put(None)
         self._writer.join()
         try:
             self._bag.close()
@@ -148,13 +146,13 @@ class Recorder:
         profiles = [publisher.qos_profile for publisher in publishers]
         topic = Topic(name, type_name, [offered(profile) for profile in profiles], str(publishers[0].topic_type_hash))
         try:
-            self._queue.put((topic, definition(type_name)))
+            self._jobs.put(partial(self._bag.add_topic, topic, definition(type_name)))
         except UnknownTypeError as error:
             self.refused[name] = str(error)
             return
 
         def take(data: bytes) -> None:
-            self._queue.put((name, data, time.time_ns()))
+            self._jobs.put(partial(self._bag.write, name, data, time.time_ns()))
 
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
@@ -188,7 +186,7 @@ class Recorder:
                 asked = self._clients[path].get_parameters([name])
                 asked.add_done_callback(lambda answer: keep(name, answer.result().values))
             else:
-                self._queue.put((PARAMETER_EVENTS, serialize_message(event), begun))
+                self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, serialize_message(event), begun))
 
         def keep(name: str, answer: Sequence[Any]) -> None:
             event.new_parameters += [Parameter(name=name, value=value) for value in answer]
@@ -200,24 +198,18 @@ class Recorder:
 
     def _write(self) -> None:
         """Write what arrives; compression must not hold up the executor."""
-        while (item := self._next()) is not None:
-            if self._failure is not None:
-                continue
+        while True:
             try:
-                if len(item) == 0:
-                    self._bag.flush()
-                elif len(item) == 2:
-                    self._bag.add_topic(*item)
-                else:
-                    self._bag.write(*item)
-            except Exception as error:  # the library raises plain ones and asserts; nobody would see this thread end
-                self._failure = error
-
-    def _next(self) -> _Item | None:
-        try:
-            return self._queue.get(timeout=IDLE_S)
-        except queue.Empty:
-            return ()
+                job = self._jobs.get(timeout=IDLE_S)
+            except queue.Empty:
+                job = self._bag.flush
+            if job is None:
+                return
+            if self._failure is None:
+                try:
+                    job()
+                except Exception as error:  # the library raises plain ones and asserts; nobody would see the thread end
+                    self._failure = error
 
 
 def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
