@@ -85,15 +85,13 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
 
     rows, curvatures = [], curvatures_of(client.capabilities)
     with progress_bar() as progress:
-        task = progress.add_task("focus", total=len(curvatures))
-        for curvature in curvatures:
+        for curvature in progress.track(curvatures, description="focus"):
             prediction = client.focus(curvature, dry_run=True)
             client.move_focus(curvature, settle_time=settle)
             measurement, image = client.measure_map(f"focus {curvature:+.3f}")
             sag, info = map_of(image), measurement.info
             error = surface_error(sag, info, FocusTarget(curvature))
             rows.append({"curvature": curvature, "prediction": prediction, "sag": sag, "info": info, "error": error})
-            progress.advance(task)
     return rows
 
 
