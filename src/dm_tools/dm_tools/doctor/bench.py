@@ -60,12 +60,8 @@ def bench_checks(file: Path) -> Iterator[Check]:
 
 def _sound(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Those of a node's values that are given and allowed."""
-    known = _known(node)
-    return {
-        name: value
-        for name, value in values.items()
-        if name in known and value != UNSET and not _wrong(known[name], value)
-    }
+    known, problems = _known(node), _problems(node, values)
+    return {name: value for name, value in values.items() if name in known and value != UNSET and name not in problems}
 
 
 def _folder_of(config: Config, node: str, name: str) -> Path | None:
@@ -98,27 +94,23 @@ def own_values(config: Config) -> Finding | None:
 
 def parameters(config: Config) -> Finding | None:
     """Names nobody knows, wrong types, values out of their range; all of them at once."""
-    wrong: list[str] = []
-    for node, values in config.items():
-        known = _known(node)
-        for name, value in values.items():
-            if name in known:
-                problem = "" if value == UNSET else _wrong(known[name], value)
-                wrong += [f"{node}: {problem}"] if problem else []
-            elif name not in COMMON:
-                wrong.append(f"{node}: {unknown_name('parameter', name, known)}")
-    if wrong:
-        return Finding("; ".join(wrong), "correct the file; docs/parameters.md lists every parameter with its range")
-    return None
+    wrong = [f"{node}: {text}" for node, values in config.items() for text in _problems(node, values).values()]
+    cure = "correct the file; docs/parameters.md lists every parameter with its range"
+    return Finding("; ".join(wrong), cure) if wrong else None
 
 
-def _wrong(parameter: Parameter, value: Any) -> str:
-    """What is wrong with one value, as a sentence; "" = nothing."""
-    try:
-        parameter.check(value)
-    except ParameterError as error:
-        return str(error)
-    return ""
+def _problems(node: str, values: Mapping[str, Any]) -> dict[str, str]:
+    """What is wrong with the values of a node, by their names; what is still to be set is not among them."""
+    known, found = _known(node), {}
+    for name, value in values.items():
+        if name in known and value != UNSET:
+            try:
+                known[name].check(value)
+            except ParameterError as error:
+                found[name] = str(error)
+        elif name not in (*known, *COMMON):
+            found[name] = str(unknown_name("parameter", name, known))
+    return found
 
 
 def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
