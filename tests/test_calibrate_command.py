@@ -93,6 +93,11 @@ def test_the_promise_is_what_requests_will_be_told(
     assert f"promise: {promised}" in capsys.readouterr().out
 
 
+def test_a_worse_calibration_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+    show_result(Calibrate.Result(id="c2", message="90 maps, residual 1 nm; warning: it promises 338 nm, c1 2.3 nm"))
+    assert "warning: it promises 338 nm, c1 2.3 nm" in capsys.readouterr().out
+
+
 def test_what_a_run_does_not_have_is_no_zero() -> None:
     figures = figures_of(Calibrate.Result(maps=90, held_out_rms=3e-9))
     assert figures["held_out_rms_nm"] == pytest.approx(3.0)

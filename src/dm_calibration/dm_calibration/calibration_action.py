@@ -289,12 +289,8 @@ class CalibrateAction:
         result.file = str(self._manager.keep(calibration))
         run.journal.remove()
         result.id = calibration.id
-        if goal.activate:
-            self._manager.use(calibration)
+        warning = self._manager.use(calibration) if goal.activate else ""
         found = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
-        result.message = (
-            f"{result.maps} maps, residual {fit.in_sample_rms * 1e9:.2f} nm in sample, "
-            f"{fit.held_out_rms * 1e9:.2f} nm held out{found}"
-        )
-        if goal.until:
-            result.message += f"; {self._enough.sentence(result.hysteresis_held_out_max_zernike)}"
+        residuals = f"{fit.in_sample_rms * 1e9:.2f} nm in sample, {fit.held_out_rms * 1e9:.2f} nm held out{found}"
+        reached = self._enough.sentence(result.hysteresis_held_out_max_zernike) if goal.until else ""
+        result.message = "; ".join(filter(None, (f"{result.maps} maps, residual {residuals}", reached, warning)))

@@ -11,8 +11,12 @@ from dm_calibration.calibrator import Provenance
 from dm_calibration.store.calibration_store import CalibrationStore, raw_hash
 from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal, UnknownNameError
+from dm_common.figures import in_nanometres
 from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError
+
+#: A calibration whose promise is so many times that of the one it replaces is worth a warning.
+CLEARLY_WORSE = 2.0
 
 
 class CalibrationManager:
@@ -84,12 +88,22 @@ class CalibrationManager:
         if wrong := self.mismatch(calibration):
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
 
-    def use(self, calibration: Calibration | None) -> None:
-        """Use `calibration`, which is in the store, from now on. Raises Refusal where the node rests by now."""
+    def use(self, calibration: Calibration | None) -> str:
+        """Use `calibration`, which is in the store, from now on. Raises Refusal where the node rests by now.
+
+        Returns a warning where it promises clearly less than the one it replaces; "" = it does not.
+        """
         with self._lock:
+            before = self.in_use
             if calibration is not None and (reason := self._resting()):
                 raise Refusal(ErrorCode.NODE_INACTIVE, f"{calibration.id} is stored, but not used: {reason}")
             self._put(calibration)
+        if calibration is None or before is None or calibration.promise <= CLEARLY_WORSE * before.promise:
+            return ""
+        return (
+            f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
+            f"{in_nanometres(before.promise)} (load_calibration brings that back)"
+        )
 
     def _put(self, calibration: Calibration | None) -> None:
         """Take `calibration` in use; the lock must be held."""

@@ -195,8 +195,8 @@ class CalibrationNode(ManagedNode):
         response.held_out_rms = calibration.fit.held_out_rms
         response.condition_number = calibration.fit.condition_number
         response.message = f"fitted again from {stored.id}: {int(calibration.fit.used.sum())} maps used"
-        if request.activate:
-            self._manager.use(calibration)
+        if request.activate and (warning := self._manager.use(calibration)):
+            response.message += f"; {warning}"
         return response
 
     def _on_store_recipes(self, request: Any, response: Any) -> Any:

@@ -94,6 +94,19 @@ def test_what_comes_after_a_cleanup_is_not_used(stand: Stand) -> None:
     assert stand.manager.in_use is None and stand.published[-1] is None
 
 
+def test_one_that_promises_clearly_less_is_used_with_a_warning(stand: Stand, calibration: Calibration) -> None:
+    def promising(share: float) -> Calibration:
+        fit = replace(calibration.fit, held_out_max_zernike=share * calibration.promise)
+        made = replace(calibration, id=f"of_{share:g}", fit=fit)
+        stand.store.save(made)
+        return made
+
+    assert stand.manager.use(promising(1.9)) == ""
+    assert "warning: it promises" in (said := stand.manager.use(promising(40.0))) and "of_1.9 that it replaces" in said
+    assert stand.manager.in_use is not None and stand.manager.in_use.id == "of_40"
+    assert stand.manager.use(calibration) == ""
+
+
 def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     before, published = stand.file.read_bytes(), len(stand.published)
 

@@ -28,6 +28,11 @@ SILENCE_S = 150.0
 PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
 
 
+def warning_in(result: Any) -> str:
+    """What the message of a Calibrate result warns of; "" = nothing."""
+    return next((part for part in result.message.split("; ") if part.startswith("warning: ")), "")
+
+
 class ExternalGoals:
     """Follows all goals of one action by its status and feedback topics. May be asked from any thread.
 

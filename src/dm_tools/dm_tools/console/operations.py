@@ -13,6 +13,7 @@ from dm_common.optics.zernike import rms_beyond_tilt
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
+from dm_tools.long_actions import warning_in
 
 #: What the plans of a calibration are called.
 PLANS = {
@@ -76,7 +77,7 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
     if result.poke_check_passed:
         findings = " Poke check passed: wiring and orientation are as configured."
     made = f"{result.id}: held-out residual {result.held_out_rms * NM:.1f} nm rms. " if result.id else ""
-    return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings}"
+    return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings} {warning_in(result)}".rstrip()
 
 
 async def estimate(session: Session, goal: Calibrate.Goal) -> str:
