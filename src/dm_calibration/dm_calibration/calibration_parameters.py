@@ -6,8 +6,9 @@ from typing import Any
 from dm_calibration.calibration import CALIBRATED_ERROR_MAX
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.bump_check import BumpOptions
+from dm_calibration.procedure.plan import PlanOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
-from dm_calibration.recalibration.drift_filter import DriftRates
+from dm_calibration.recalibration.drift import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of, real, switch, text, whole
@@ -26,9 +27,7 @@ PARAMETERS = (
         switch(True),
         "Write the report of every calibration that is stored, <id>.html and <id>.pdf, beside its file.",
     ),
-    live("poke_amplitude", real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised."),
-    live("reference_every", whole(10, 1, 1000), "Steps between two reference frames."),
-    live("hysteresis_maps", whole(200, 60, 2000), "Commands of a hysteresis plan; more, less noise."),
+    *parameters_of("", PlanOptions),
     live("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time."),
     live(
         "map_time",
@@ -80,16 +79,7 @@ PARAMETERS = (
         "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
     ),
     *parameters_of("updates.", UpdateOptions),
-    Parameter(
-        "updates.gain_rate",
-        real(3e-4, 0.0, 1.0),
-        "Expected relative drift of a gain in one day; it grows with the root of time. 0 = the gains stay.",
-    ),
-    Parameter(
-        "updates.figure_rate",
-        real(1e-9, 0.0, 1e-6, "m"),
-        "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
-    ),
+    *parameters_of("updates.", DriftRates),
     live("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Drift of a gain from which to warn."),
     live("updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Drift of the figure from which to warn."),
     live(
@@ -131,5 +121,5 @@ def update_options(values: Mapping[str, Any]) -> UpdateOptions:
         aperture_tolerance=values["aperture_tolerance"],
         # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
-        rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),
+        rates=from_values(DriftRates, values, "updates."),
     )

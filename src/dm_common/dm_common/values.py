@@ -130,10 +130,14 @@ real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, 
 reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
 
 
-def parameter(value: Value, description: str, live: bool = False) -> Any:
-    """A field of a dataclass that is a parameter of a node as well, see `dm_common.ros.parameters.parameters_of`."""
+def parameter(value: Value, description: str, live: bool = False, name: str = "") -> Any:
+    """A field of a dataclass that is a parameter of a node as well, see `dm_common.ros.parameters.parameters_of`.
+
+    Args:
+        name: of the parameter; "" = that of the field.
+    """
     default = tuple(value.default) if value.many else value.default
-    return field(default=default, metadata={"value": value, "description": description, "live": live})
+    return field(default=default, metadata={"value": value, "description": description, "live": live, "name": name})
 
 
 #: One that may change while the node runs.
@@ -141,9 +145,10 @@ live_parameter = partial(parameter, live=True)
 
 
 def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **others: Any) -> T:
-    """The dataclass `kind` of those `values` that are called as its fields behind `prefix`, and of `others`."""
-    own = {each.name: values[prefix + each.name] for each in fields(kind) if prefix + each.name in values}  # type: ignore[arg-type]
-    return kind(**{name: tuple(given) if isinstance(given, list) else given for name, given in own.items()} | others)
+    """The dataclass `kind` of those `values` that are called as its parameters behind `prefix`, and of `others`."""
+    own = {each.name: prefix + (each.metadata.get("name") or each.name) for each in fields(kind)}  # type: ignore[arg-type]
+    given = {name: values[parameter] for name, parameter in own.items() if parameter in values}
+    return kind(**{name: tuple(one) if isinstance(one, list) else one for name, one in given.items()} | others)
 
 
 class Fields:

@@ -17,6 +17,7 @@ from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_tr
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
+from dm_common.values import parameter, real, text, texts
 
 _POLL_OUTPUT_S = 0.01
 #: A watched file's modification time further in the past is not believed (clocks of two machines differ).
@@ -27,23 +28,26 @@ FOLDER_PATIENCE_S = 5.0
 
 @dataclass(frozen=True)
 class AcquisitionSettings:
-    """Where maps come from.
-
-    Attributes:
-        folder: watched folder; None = watch nothing.
-        patterns: names of the files to take from it.
-        stable_time: s for which a file must stand still.
-        trigger_command: argument list; empty = a person or the instrument itself starts the measurement.
-        trigger_suffix: ending of the file name that replaces `{path}` in the command.
-        trigger_timeout: s for the command.
-    """
+    """Where maps come from; `folder`: see `watch_folder`, None = watch nothing."""
 
     folder: Path | None
-    patterns: Sequence[str]
-    stable_time: float
-    trigger_command: Sequence[str] = ()
-    trigger_suffix: str = ".datx"
-    trigger_timeout: float = 30.0
+    patterns: Sequence[str] = parameter(
+        texts(["*.dat", "*.datx", "*.asc", "*.xyz", "*.fits", "*.h5", "*.4D"]),
+        "Names of the files to take from watch_folder, as shell patterns.",
+        name="file_pattern",
+    )
+    stable_time: float = parameter(
+        real(0.5, 0.02, 3600.0, "s"), "Time for which size and time of a file must stand still."
+    )
+    trigger_command: Sequence[str] = parameter(
+        texts([]),
+        "Command that makes the instrument take a map, as an argument list (no shell); {path} in an argument is "
+        "replaced by the file in watch_folder it must write. Empty = measure waits for the next new file.",
+    )
+    trigger_suffix: str = parameter(
+        text(".datx"), "Ending of the file name that replaces {path}.", name="trigger_output_suffix"
+    )
+    trigger_timeout: float = parameter(real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command.")
 
     @property
     def names_output(self) -> bool:

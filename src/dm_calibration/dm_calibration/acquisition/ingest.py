@@ -38,28 +38,45 @@ class IngestSettings:
     """How maps are read and judged.
 
     Attributes:
-        pitch: m per pixel, better known than to the files; 0 = as they tell.
-        wavelength: expected, m; 0 = any.
-        wavelength_tolerance: m.
         orientation: from the instrument's picture to the mirror frame.
-        aperture_radius: m; 0 = find the aperture from the valid pixels.
         mirror_radius: m; no aperture_radius is larger. 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
-        aperture_follow: from the centre of the valid region, found anew in each map, instead.
-        valid_fraction_min: valid pixels / pixels inside the aperture.
         reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
     """
 
-    pitch: float = 0.0
-    wavelength: float = 0.0
-    wavelength_tolerance: float = 1e-9
     orientation: Orientation = field(default_factory=Orientation)
-    aperture_radius: float = 0.0
     mirror_radius: float = 0.0
     aperture_centre: tuple[float, float] = (0.0, 0.0)
-    aperture_follow: bool = False
-    valid_fraction_min: float = 0.7
     reference: SurfaceMap | None = None
+    aperture_radius: float = live_parameter(
+        real(0.0, 0.0, 1.0, "m"),
+        "Radius of the aperture; 0 = find the valid region of each map.",
+        name="aperture.radius",
+    )
+    aperture_follow: bool = live_parameter(
+        switch(False),
+        "Count aperture.centre_x and centre_y from the centre of the valid region, found anew in each map, where that "
+        "ends at the rim of the mirror or of a mask on it.",
+        name="aperture.follow",
+    )
+    valid_fraction_min: float = live_parameter(
+        real(0.7, 0.0, 1.0),
+        "Least share of valid pixels in the aperture of a map that is published; maps with fewer are refused.",
+        name="aperture.valid_fraction_min",
+    )
+    wavelength: float = live_parameter(
+        real(0.0, 0.0, 2e-5, "m"),
+        "Wavelength of the instrument; maps of another are refused. 0 = any.",
+        name="wavelength.expected",
+    )
+    wavelength_tolerance: float = live_parameter(
+        real(1e-9, 0.0, 1e-6, "m"), "Allowed difference from it.", name="wavelength.tolerance"
+    )
+    pitch: float = live_parameter(
+        real(0.0, 0.0, 0.1, "m"),
+        "Lateral resolution per pixel, as `./dm measure --reference-sphere METRES` finds it; files that tell one "
+        "that differs by more than 5 % are refused. 0 = as the files tell.",
+    )
     # Retrace and distortion are taken off then; see `dm_calibration.optics.instrument`.
     retrace: tuple[float, ...] = parameter(
         reals([], -1.0, 1.0),

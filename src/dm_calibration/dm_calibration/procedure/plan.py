@@ -8,10 +8,11 @@ from itertools import chain
 
 import numpy as np
 
-from dm_calibration.hysteresis.excitation import MAPS_MIN, REPEATS, excitation, next_part
+from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS, excitation, next_part
 from dm_calibration.influence import surfaces
 from dm_common import Floats
 from dm_common.mirror import Mirror
+from dm_common.values import live_parameter, real, whole
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
@@ -78,25 +79,18 @@ class PlanOptions:
     """How to measure.
 
     Attributes:
-        poke_amplitude: half-swing of a push-pull poke, normalised.
-        reference_every: steps between two reference frames.
         surfaces: names of Table 1; empty = all.
-        hysteresis_maps: commands of a hysteresis plan, at most.
         until: accuracy at which a hysteresis plan may end, m; 0 = never before its end.
     """
 
-    poke_amplitude: float = 0.5
-    reference_every: int = 10
+    poke_amplitude: float = live_parameter(real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised.")
+    reference_every: int = live_parameter(whole(10, 1, 1000), "Steps between two reference frames.")
     surfaces: Sequence[str] = ()
     degauss: bool = True
-    hysteresis_maps: int = 200
+    hysteresis_maps: int = live_parameter(
+        whole(200, MAPS_MIN, MAPS_MAX), "Commands of a hysteresis plan; more, less noise."
+    )
     until: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.poke_amplitude <= 1.0:
-            raise ValueError(f"poke_amplitude = {self.poke_amplitude}: must be above 0, at most 1")
-        if self.reference_every < 1:
-            raise ValueError(f"reference_every = {self.reference_every}: must be at least 1")
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,27 @@ from scipy.linalg import block_diag, cho_solve
 from scipy.special import ndtri
 
 from dm_common import Floats
+from dm_common.values import parameter, real
 
 
 @dataclass(frozen=True)
 class DriftRates:
-    """How fast a mirror is expected to change; standard deviations after one day, growing with the root of time.
+    """How fast a mirror is expected to change: standard deviations. Half of the variance of gains is common.
 
     Attributes:
-        gain: relative, of each gain; half of the variance is common to all (temperature).
-        figure: m rms.
-        warm_gain, warm_figure: the same for one K, known beforehand of a mirror that no map has shown warmer.
+        warm_gain, warm_figure: for one K, known beforehand of a mirror that no map has shown warmer; figure in m rms.
     """
 
-    gain: float = 3e-4
-    figure: float = 1e-9
+    gain: float = parameter(
+        real(3e-4, 0.0, 1.0),
+        "Expected relative drift of a gain in one day; it grows with the root of time. 0 = the gains stay.",
+        name="gain_rate",
+    )
+    figure: float = parameter(
+        real(1e-9, 0.0, 1e-6, "m"),
+        "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
+        name="figure_rate",
+    )
     warm_gain: float = 1e-3
     warm_figure: float = 2e-9
 

@@ -141,7 +141,8 @@ def parameters_of(prefix: str, config: Any) -> Iterator[Parameter]:
         if each.metadata:
             value, default = each.metadata["value"], getattr(config, each.name)
             value = replace(value, default=list(default) if value.many else default)
-            yield Parameter(prefix + each.name, **{**each.metadata, "value": value})
+            name = prefix + (each.metadata["name"] or each.name)
+            yield Parameter(**{**each.metadata, "name": name, "value": value})
 
 
 #: A parameter that may change while the node runs.
