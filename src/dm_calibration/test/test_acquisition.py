@@ -87,6 +87,7 @@ def test_no_shell_ever_sees_the_arguments(tmp_path: Path) -> None:
         python("import sys; open(sys.argv[1], 'w').write(sys.argv[2])", str(seen), "$(id); `id` > {path} & *"),
         tmp_path / "a b.dat",
         20,
+        threading.Event(),
     )
     assert seen.read_text() == f"$(id); `id` > {tmp_path / 'a b.dat'} & *"
 
@@ -110,7 +111,7 @@ def test_hanging_command_is_ended_with_its_children(tmp_path: Path) -> None:
     child = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-S', '-c', {child!r}, sys.argv[1]])"
     with pytest.raises(TriggerError, match=r"did not end within 1\.5 s"):
-        run_trigger(python(code, str(tmp_path / "pid")), None, 1.5)
+        run_trigger(python(code, str(tmp_path / "pid")), None, 1.5, threading.Event())
     process = Path("/proc") / (tmp_path / "pid").read_text()
     wait_until(
         lambda: not process.exists() or "Z" in (process / "stat").read_text().split()[2], what="the end of the child"

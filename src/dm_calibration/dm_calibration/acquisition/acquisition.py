@@ -49,11 +49,6 @@ class AcquisitionSettings:
     )
     trigger_timeout: float = parameter(real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command.")
 
-    @property
-    def names_output(self) -> bool:
-        """Whether the trigger command is told which file to write."""
-        return any(PLACEHOLDER in argument for argument in self.trigger_command)
-
     def __post_init__(self) -> None:
         """Raise ValueError when the settings contradict each other."""
         if self.trigger_command and self.folder is None:
@@ -155,7 +150,7 @@ class Acquisition:
             )
         deadline = time.monotonic() + timeout_s
         trigger_s = min(self.settings.trigger_timeout, timeout_s)
-        if self.settings.names_output:
+        if any(PLACEHOLDER in argument for argument in self.settings.trigger_command):
             output = self._new_name(watch)
             taken = self._trigger(output, trigger_s)
             return Acquired(*self._expected_file(output, deadline), taken)

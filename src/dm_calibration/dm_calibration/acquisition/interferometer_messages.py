@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from dm_calibration.acquisition.sensor import sensor_surface
+from dm_calibration.acquisition.sensor import PIXELS, Seen, disc_terms
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.measurement import Measurement
@@ -75,31 +75,25 @@ def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficient
     )
 
 
-def coefficients_of(message: ZernikeCoefficients) -> NDArray[np.float64]:
-    """(21,) m in the order of Born & Wolf, of a message in any convention.
+def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
+    """The surface that a sensor has seen, and what its terms leave unexplained, m.
 
     Raises:
         MapRejectedError: an unknown convention, too few terms, or values that are not finite.
     """
+    radius, wavelength = message.radius, message.wavelength
+    if message.convention not in _TO_BORN_WOLF:
+        known = sorted(_TO_BORN_WOLF)
+        raise MapRejectedError(f"{source}: convention = {message.convention}: must be one of {known}")
     try:
-        convert = _TO_BORN_WOLF[message.convention]
-        coefficients = convert(np.array(message.coefficients, dtype=np.float64))
-    except KeyError as error:
-        raise MapRejectedError(f"convention = {error}: must be one of {sorted(_TO_BORN_WOLF)}") from error
+        coefficients = _TO_BORN_WOLF[message.convention](np.array(message.coefficients, dtype=np.float64))
     except ValueError as error:
-        raise MapRejectedError(str(error)) from error
-    if not (np.isfinite(coefficients).all() and np.isfinite([message.radius, message.wavelength]).all()):
-        raise MapRejectedError("coefficients, radius and wavelength: must be finite")
-    return coefficients
-
-
-def sensor_map(message: ZernikeCoefficients, source: str) -> tuple[SurfaceMap, float]:
-    """The surface that a sensor has seen, and what its terms leave unexplained, m. Raises MapRejectedError."""
-    try:
-        coefficients = coefficients_of(message)
-    except MapRejectedError as error:
         raise MapRejectedError(f"{source}: {error}") from error
-    return sensor_surface(coefficients, message.radius, message.wavelength, source), message.residual_rms
+    if not np.isfinite([*coefficients, radius, wavelength]).all():
+        raise MapRejectedError(f"{source}: coefficients, radius and wavelength: must be finite")
+    pitch = 2.0 * radius / PIXELS if radius > 0.0 else None
+    surface = SurfaceMap(disc_terms() @ coefficients, wavelength, pitch, "zernike", instrument=source)
+    return surface, message.residual_rms
 
 
 def samples_message(measured: Measurement, header: Header) -> SurfaceSamples:

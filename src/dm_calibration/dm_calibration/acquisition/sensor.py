@@ -24,17 +24,11 @@ Seen = tuple[SurfaceMap, float]
 
 
 @cache
-def _terms() -> NDArray[np.float64]:
-    """(PIXELS, PIXELS, 21), NaN outside the disc that touches the edges; row 0 = top."""
+def disc_terms() -> NDArray[np.float64]:
+    """The terms over a map, (PIXELS, PIXELS, 21), NaN outside the disc that touches the edges; row 0 = top."""
     centres = (2.0 * np.arange(PIXELS) + 1.0) / PIXELS - 1.0
     x, y = np.meshgrid(centres, -centres)
     return np.where((x**2 + y**2 <= 1.0)[..., None], basis(x, y), np.nan)
-
-
-def sensor_surface(coefficients: NDArray[np.float64], radius: float, wavelength: float, source: str) -> SurfaceMap:
-    """The sag of `coefficients` (21,), m, over a disc of `radius`, m (0 = not known)."""
-    pitch = 2.0 * radius / PIXELS if radius > 0.0 else None
-    return SurfaceMap(_terms() @ coefficients, wavelength, pitch, "zernike", instrument=source)
 
 
 def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:

@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -16,7 +17,7 @@ from dm_common.errors import CodedError, ErrorCode
 PLACEHOLDER = "{path}"
 
 _OUTPUT_SHOWN = 500  # characters of the command's output in an error message
-_POLL_S = 0.05
+_POLL_S = 0.01
 
 
 class TriggerError(CodedError):
@@ -25,9 +26,7 @@ class TriggerError(CodedError):
     error_code = ErrorCode.TRIGGER_FAILED
 
 
-def run_trigger(
-    command: Sequence[str], output: Path | None, timeout_s: float, cancelled: threading.Event | None = None
-) -> None:
+def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, cancelled: threading.Event) -> None:
     """Run the command (an argument list; no shell is involved) and wait for its end.
 
     The command runs in its own process group, which is killed as a whole on time-out or cancellation.
@@ -49,31 +48,20 @@ def run_trigger(
             raise TriggerError(f"trigger command {arguments[0]!r} cannot be started: {error}") from error
         deadline = time.monotonic() + timeout_s
         try:
-            while True:
-                try:
-                    status = process.wait(min(_POLL_S, max(deadline - time.monotonic(), 0.001)))
-                    break
-                except subprocess.TimeoutExpired:
-                    if cancelled is not None and cancelled.is_set():
-                        raise TriggerError(f"trigger command {arguments[0]!r} was cancelled") from None
-                    if time.monotonic() >= deadline:
-                        raise TriggerError(
-                            f"trigger command {arguments[0]!r} did not end within {timeout_s:g} s{_tail(log)}"
-                        ) from None
+            while (status := process.poll()) is None:
+                if cancelled.wait(_POLL_S):
+                    raise TriggerError(f"trigger command {arguments[0]!r} was cancelled")
+                if time.monotonic() >= deadline:
+                    raise TriggerError(
+                        f"trigger command {arguments[0]!r} did not end within {timeout_s:g} s{_tail(log)}"
+                    )
         finally:
-            _kill(process)
+            if process.poll() is None:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)  # with all it started
+                process.wait()
         if status != 0:
             raise TriggerError(f"trigger command {arguments[0]!r} ended with status {status}{_tail(log)}")
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a command that still runs, with all it started."""
-    if process.poll() is None:
-        try:
-            os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
-        process.wait()
 
 
 def _tail(log: IO[bytes]) -> str:
