@@ -287,13 +287,14 @@ def test_a_run_killed_while_it_was_stored_measures_no_more(tmp_path: Path, monke
     run.journal.close()
     again = opened(tmp_path, POKES)
     concluded: list[OpenRun] = []
-    services: Any = SimpleNamespace(rest=lambda _signals: "")
-    action: Any = CalibrateAction(SimpleNamespace(), {}, services, SimpleNamespace(), dict)  # type: ignore[arg-type]
+    services = SimpleNamespace(rest=lambda _signals: "", settle_time=0.0, map_time=0.0)
+    handle = SimpleNamespace(request=Calibrate.Goal(), publish_feedback=lambda _feedback: None)
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, SimpleNamespace(), dict, handle)  # type: ignore[arg-type]
+    action._plan, action._mirror = POKES, MIRROR
     unmoved = SimpleNamespace(run=lambda: pytest.fail("the procedure runs again"))
     monkeypatch.setattr(action, "_opened", lambda *_: again)
-    monkeypatch.setattr(action, "_procedure", lambda *_: (unmoved, lambda *_: None))
-    monkeypatch.setattr(action, "_conclude", lambda _goal, _plan, _mirror, run, *_: concluded.append(run))
-    handle = SimpleNamespace(request=Calibrate.Goal())
-    action._run_kept(handle, POKES, PlanOptions(), MIRROR, None, Calibrate.Result())
+    monkeypatch.setattr(action, "_procedure", lambda *_: unmoved)
+    monkeypatch.setattr(action, "_conclude", lambda run, *_: concluded.append(run))
+    action._run_kept(None)
     assert [run.storing for run in concluded] == [Storing("stored", 1)]
     assert len(again.outcome.records) == 5

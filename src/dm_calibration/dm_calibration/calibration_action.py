@@ -16,13 +16,12 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, step_times
-from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
-from dm_common.mirror import Mirror
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
@@ -43,7 +42,7 @@ START_GRACE_S = 5.0
 
 
 class CalibrateAction:
-    """Runs one goal at a time, in a worker thread."""
+    """One goal, in a worker thread."""
 
     def __init__(
         self,
@@ -52,29 +51,34 @@ class CalibrateAction:
         services: BenchServices,
         manager: CalibrationManager,
         driver_facts: Callable[[], Mapping[str, Any]],
+        handle: WorkerGoal,
     ) -> None:
         """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
         self._node, self._values, self._services, self._manager = node, values, services, manager
-        self._driver_facts, self._enough = driver_facts, GoodEnough(0.0)
+        self._driver_facts, self._handle, self._goal = driver_facts, handle, handle.request
+        self._maps_per_state = self._goal.maps_per_state or 1
+        self._result = without_figures(Calibrate.Result())
+        self._feedback, self._sent, self._end = Calibrate.Feedback(), -FEEDBACK_PERIOD_S, 0
 
-    def run(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:
-        goal, result = handle.request, without_figures(Calibrate.Result())
+    def run(self) -> tuple[str, Calibrate.Result]:
+        """Carry the goal out; returns how it ended, and the result."""
+        goal, result = self._goal, self._result
         clock = self._node.get_clock()
         started = clock.now()
         try:
-            mirror = self._manager.known_mirror(wait_s=START_GRACE_S)
+            self._mirror = self._manager.known_mirror(wait_s=START_GRACE_S)
             wait_for_clock(clock)
             started = clock.now()
-            plan, options = self._planned(goal, mirror)
-            self._forecast(goal, plan, mirror, result)
+            self._make_plan()
+            self._forecast()
             if goal.dry_run:
                 return "succeed", result
             self._services.check_ready()
             self._services.settle_time = goal.settle_time or self._values["settle_time"]
-            self._services.cancelled = lambda: bool(handle.is_cancel_requested)
+            self._services.cancelled = lambda: bool(self._handle.is_cancel_requested)
             held = self._services.held(goal, "cancel the action calibrate to end it", result.expected_duration)
             with UnfinishedRuns(self._manager.store.folder) as runs, held:
-                self._run_kept(handle, plan, options, mirror, runs, result)
+                self._run_kept(runs)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
         result.maps_dropped = len(result.dropped)
@@ -85,64 +89,12 @@ class CalibrateAction:
         self._node.get_logger().warning(f"calibration ended with code {result.error_code}: {result.message}")
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
 
-    def _run_kept(
-        self,
-        handle: WorkerGoal,
-        plan: Plan,
-        options: PlanOptions,
-        mirror: Mirror,
-        runs: UnfinishedRuns,
-        result: Calibrate.Result,
-    ) -> None:
-        """Begin or resume a run, keep each map as it comes, conclude; fills `result`, also after a failure."""
-        run = self._opened(handle.request, plan, options, mirror, runs)
-        procedure, report = self._procedure(handle, plan, options, mirror, run)
-        try:
-            if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
-                procedure.run()
-            report(Calibrate.Feedback.PHASE_FIT, "fit", len(plan.steps))
-            self._conclude(handle.request, plan, mirror, run, runs, report, result)
-        except EXPECTED as error:
-            result.error_code, result.message = error_code(error), str(error)
-            result.maps = result.maps or len(run.outcome.records)
-            result.dropped = result.dropped or list(run.outcome.dropped)
-        finally:
-            run.journal.close()
-            rested = self._services.rest(mirror.rest)
-        kept = ""
-        if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
-            kept = (
-                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal goes on from there, "
-                "`dm calibrate --fresh` begins anew"
-            )
-        result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
-
-    def _opened(
-        self, goal: Calibrate.Goal, plan: Plan, options: PlanOptions, mirror: Mirror, runs: UnfinishedRuns
-    ) -> OpenRun:
-        in_use = self._manager.in_use
-        settings = {
-            "settle_time_s": self._services.settle_time,
-            "maps_per_state": goal.maps_per_state or 1,
-            "degauss": "over the full range, steps as configured in the driver" if options.degauss else "none",
-            "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
-        }
-        identity = identity_of(plan, options, mirror, settings, self._driver_facts())
-        resume = ResumeOptions(
-            self._values["resume_max_age"], self._values["start_fresh"], self._node.get_clock().now().nanoseconds
-        )
-        run = open_run(runs, identity, plan, resume, goal.maps_per_state or 1, goal.note)
-        if resume.fresh:  # for one goal only
-            self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
-        for text in filter(None, (*run.notes, run.resumed)):
-            self._node.get_logger().info(text)
-        return run
-
-    def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
-        """The plan of a goal and what it follows from."""
+    def _make_plan(self) -> None:
+        """The plan of the goal and what it follows from."""
+        goal = self._goal
         if goal.until and goal.plan != PlanKind.HYSTERESIS:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
-        options = PlanOptions(
+        self._options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],
             surfaces=tuple(goal.surfaces),
@@ -150,13 +102,14 @@ class CalibrateAction:
             hysteresis_maps=goal.hysteresis_maps or (LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]),
             until=goal.until,
         )
-        return make_plan(PlanKind(goal.plan or PlanKind.FULL), mirror, options), options
+        self._plan = make_plan(PlanKind(goal.plan or PlanKind.FULL), self._mirror, self._options)
 
-    def _forecast(self, goal: Calibrate.Goal, plan: Plan, mirror: Mirror, result: Calibrate.Result) -> None:
+    def _forecast(self) -> None:
         """Fill in what is to be expected; the message of a dry run."""
+        goal, plan, result = self._goal, self._plan, self._result
         in_use, taken, guessed = self._manager.in_use, self._services.map_time, self._values["map_time"]
         settle_time = goal.settle_time or self._values["settle_time"]
-        expected = forecast(plan, settle_time, in_use, mirror, taken, goal.until, guessed)
+        expected = forecast(plan, settle_time, in_use, self._mirror, taken, goal.until, guessed)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
@@ -166,99 +119,113 @@ class CalibrateAction:
             time_text = f"{maps} maps in about {expected.duration:.0f} s{guess}"
             result.message = f"{time_text}{expected.accuracy(goal.until, drawn)}; nothing was moved"
 
-    def _procedure(
-        self, handle: WorkerGoal, plan: Plan, options: PlanOptions, mirror: Mirror, run: OpenRun
-    ) -> tuple[Procedure, Callable[[int, str, int], None]]:
-        """The run of `plan`, and a function that reports phase, label and step."""
-        feedback = Calibrate.Feedback(steps=len(plan.steps))
-        feedback.plan = plan_text(plan.kind, options, handle.request.maps_per_state or 1)
-        sent, end = -FEEDBACK_PERIOD_S, 0
+    def _run_kept(self, runs: UnfinishedRuns) -> None:
+        """Begin or resume a run, keep each map as it comes, conclude; fills the result, also after a failure."""
+        result, run = self._result, self._opened(runs)
+        enough = GoodEnough(self._goal.until, lambda reached: self._report_reached(reached, len(run.outcome.records)))
+        procedure = self._procedure(run, enough)
+        try:
+            if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
+                procedure.run()
+            self._report(Calibrate.Feedback.PHASE_FIT, "fit", len(self._plan.steps))
+            self._conclude(run, runs, enough)
+        except EXPECTED as error:
+            result.error_code, result.message = error_code(error), str(error)
+            result.maps = result.maps or len(run.outcome.records)
+            result.dropped = result.dropped or list(run.outcome.dropped)
+        finally:
+            run.journal.close()
+            rested = self._services.rest(self._mirror.rest)
+        kept = ""
+        if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
+            kept = (
+                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal goes on from there, "
+                "`dm calibrate --fresh` begins anew"
+            )
+        result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
 
-        def report(phase: int, label: str, step: int) -> None:
-            nonlocal sent
-            feedback.phase, feedback.label, feedback.step = phase, label, step
-            left = step_times(plan.steps[step:end], self._services.settle_time, self._services.map_time)
-            feedback.maps_left, feedback.time_left = len(left), float(left.sum())
-            if time.monotonic() - sent >= FEEDBACK_PERIOD_S:
-                sent = time.monotonic()
-                handle.publish_feedback(feedback)
+    def _opened(self, runs: UnfinishedRuns) -> OpenRun:
+        in_use, plan = self._manager.in_use, self._plan
+        settings = {
+            "settle_time_s": self._services.settle_time,
+            "maps_per_state": self._maps_per_state,
+            "degauss": "over the full range, steps as configured in the driver" if self._options.degauss else "none",
+            "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
+        }
+        identity = identity_of(plan, self._options, self._mirror, settings, self._driver_facts())
+        resume = ResumeOptions(
+            self._values["resume_max_age"], self._values["start_fresh"], self._node.get_clock().now().nanoseconds
+        )
+        run = open_run(runs, identity, plan, resume, self._maps_per_state, self._goal.note)
+        if resume.fresh:  # for one goal only
+            self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
+        for text in filter(None, (*run.notes, run.resumed)):
+            self._node.get_logger().info(text)
+        return run
 
-        def progress(now: Progress) -> None:
-            feedback.maps_dropped, feedback.residual_rms = now.dropped, now.residual_rms
-            # Reference frames belong to the phase around them.
-            report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
-
-        self._services.publish_waits(handle, feedback)
-
-        def report_reached(reached: float) -> None:
-            nonlocal end
-            feedback.reached_max_zernike = reached
-            end, feedback.expected_max_zernike = expected_end(plan, feedback.step, reached, handle.request.until)
-            self._node.get_logger().info(f"{len(run.outcome.records)} maps: right to {reached * 1e9:.2f} nm")
-
-        enough = self._enough = GoodEnough(handle.request.until, report_reached)
+    def _procedure(self, run: OpenRun, enough: GoodEnough) -> Procedure:
+        self._feedback.steps = len(self._plan.steps)
+        self._feedback.plan = plan_text(self._plan.kind, self._options, self._maps_per_state)
+        self._services.publish_waits(self._handle, self._feedback)
         in_use = self._manager.in_use
-        # A full plan solves its shapes on the pokes of this very run.
-        model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
-        facts = mirror_facts(mirror)
-
-        def guard() -> None:
-            if (now := self._manager.mirror) is not None and mirror_facts(now) != facts:
-                raise Refusal(
-                    ErrorCode.CALIBRATION_MISMATCH,
-                    f"the mirror changed in the middle of the run: {now.name} {now.serial!r}, before it was "
-                    f"{mirror.name} {mirror.serial!r} (or its limits did)",
-                )
-            self._services.check_history()
-
-        procedure = Procedure(
-            plan,
-            mirror,
+        return Procedure(
+            self._plan,
+            self._mirror,
             self._services,
-            procedure_options(self._values, handle.request.maps_per_state),
-            model=model,
-            progress=progress,
+            procedure_options(self._values, self._maps_per_state),
+            # A full plan solves its shapes on the pokes of this very run.
+            model=in_use.fit if in_use and self._plan.kind is PlanKind.SURFACES else None,
+            progress=self._report_progress,
             cancelled=self._services.cancelled,
             outcome=run.outcome,
             keep=run.journal.keep,
-            guard=guard,
+            guard=self._guard,
             enough=enough,
         )
-        return procedure, report
 
-    def _conclude(
-        self,
-        goal: Calibrate.Goal,
-        plan: Plan,
-        mirror: Mirror,
-        run: OpenRun,
-        runs: UnfinishedRuns,
-        report: Callable[[int, str, int], None],
-        result: Calibrate.Result,
-    ) -> None:
-        """Fit, check, store and publish what was measured; fills `result`. The journal goes when all is on disk."""
-        outcome = run.outcome
+    def _guard(self) -> None:
+        """Raise Refusal where the mirror is another one, or its history is lost."""
+        now, before = self._manager.mirror, self._mirror
+        if now is not None and mirror_facts(now) != mirror_facts(before):
+            raise Refusal(
+                ErrorCode.CALIBRATION_MISMATCH,
+                f"the mirror changed in the middle of the run: {now.name} {now.serial!r}, before it was "
+                f"{before.name} {before.serial!r} (or its limits did)",
+            )
+        self._services.check_history()
+
+    def _report(self, phase: int, label: str, step: int) -> None:
+        feedback = self._feedback
+        feedback.phase, feedback.label, feedback.step = phase, label, step
+        left = step_times(self._plan.steps[step : self._end], self._services.settle_time, self._services.map_time)
+        feedback.maps_left, feedback.time_left = len(left), float(left.sum())
+        if time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
+            self._sent = time.monotonic()
+            self._handle.publish_feedback(feedback)
+
+    def _report_progress(self, now: Progress) -> None:
+        self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms
+        # Reference frames belong to the phase around them.
+        self._report(_PHASES.get(now.kind, self._feedback.phase), now.label, now.done)
+
+    def _report_reached(self, reached: float, maps: int) -> None:
+        """Tell what the run has reached (m) after a part of so many maps, and what is left."""
+        feedback = self._feedback
+        feedback.reached_max_zernike = reached
+        self._end, feedback.expected_max_zernike = expected_end(self._plan, feedback.step, reached, self._goal.until)
+        self._node.get_logger().info(f"{maps} maps: right to {reached * 1e9:.2f} nm")
+
+    def _conclude(self, run: OpenRun, runs: UnfinishedRuns, enough: GoodEnough) -> None:
+        """Fit, check, store and publish what was measured; fills the result. The journal goes when all is on disk."""
+        goal, mirror, outcome, result = self._goal, self._mirror, run.outcome, self._result
         calibration: Calibration | None = None
         try:
-            if plan.kind is PlanKind.POKE_CHECK:
+            if self._plan.kind is PlanKind.POKE_CHECK:
                 fit = fit_influence(outcome.maps(), fit_options(self._values), rings=mirror.rings)
-                check = check_fit(fit, mirror)
             else:
-                state = self._services.state
-                unknown = goal.skip_degauss and not (state is not None and state.history_known)
-                remarks = ["Measured from an unknown hysteresis state, without a degauss before."] if unknown else []
-                provenance = self._manager.provenance(mirror.name, mirror.serial, goal.note)
-                if run.storing is not None:  # killed while storing: the same calibration again, not another one
-                    provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
-                calibration = calibrate(
-                    outcome,
-                    mirror=mirror,
-                    options=fit_options(self._values),
-                    provenance=provenance,
-                    run_limitations=remarks,
-                )
+                calibration = self._calibration(run)
                 fit = calibration.fit
-                check = check_fit(fit, mirror)
+            check = check_fit(fit, mirror)
         except ValueError as error:
             # The next goal would end in the same way; what was measured stays at hand.
             run.journal.close()
@@ -279,18 +246,30 @@ class CalibrateAction:
                 raise Refusal(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
             result.message = f"wiring and orientation are as configured: {check.pose}"
             return
-        if (hysteresis := calibration.hysteresis) is not None:
-            result.hysteresis_model, result.hysteresis_held_out_max_zernike = (
-                hysteresis.name,
-                hysteresis.held_out_max_zernike,
-            )
-        report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(plan.steps))
+        if (found := calibration.hysteresis) is not None:
+            result.hysteresis_model, result.hysteresis_held_out_max_zernike = found.name, found.held_out_max_zernike
+        self._report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(self._plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
         result.file = str(self._manager.keep(calibration))
         run.journal.remove()
         result.id = calibration.id
         warning = self._manager.use(calibration) if goal.activate else ""
-        found = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
-        residuals = f"{fit.in_sample_rms * 1e9:.2f} nm in sample, {fit.held_out_rms * 1e9:.2f} nm held out{found}"
-        reached = self._enough.sentence(result.hysteresis_held_out_max_zernike) if goal.until else ""
+        wrong = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
+        residuals = f"{fit.in_sample_rms * 1e9:.2f} nm in sample, {fit.held_out_rms * 1e9:.2f} nm held out{wrong}"
+        reached = enough.sentence(result.hysteresis_held_out_max_zernike) if goal.until else ""
         result.message = "; ".join(filter(None, (f"{result.maps} maps, residual {residuals}", reached, warning)))
+
+    def _calibration(self, run: OpenRun) -> Calibration:
+        """What the maps of the run give."""
+        state = self._services.state
+        unknown = self._goal.skip_degauss and not (state is not None and state.history_known)
+        provenance = self._manager.provenance(self._mirror.name, self._mirror.serial, self._goal.note)
+        if run.storing is not None:  # killed while storing: the same calibration again, not another one
+            provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
+        return calibrate(
+            run.outcome,
+            mirror=self._mirror,
+            options=fit_options(self._values),
+            provenance=provenance,
+            run_limitations=["Measured from an unknown hysteresis state, without a degauss before."] if unknown else [],
+        )

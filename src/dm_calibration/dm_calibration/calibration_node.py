@@ -36,7 +36,7 @@ from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import WARN, Health, ManagedNode
-from dm_common.ros.worker import WorkerActionServer, WorkerService
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService
 from dm_common.values import reals
 
 
@@ -63,9 +63,8 @@ class CalibrationNode(ManagedNode):
         )
         self._bench_services = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}
-        action = CalibrateAction(self, self._values, self._bench_services, self._manager, lambda: self._driver_facts)
         self._server = WorkerActionServer(
-            self, Calibrate, "calibrate", action.run, exclusive="refuse", fields=requests.CALIBRATE
+            self, Calibrate, "calibrate", self._calibrate, exclusive="refuse", fields=requests.CALIBRATE
         )
         self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
@@ -110,6 +109,10 @@ class CalibrationNode(ManagedNode):
         if self._server.busy and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench_services.rest_at_exit(mirror.rest)}")
         self._reports.end()
+
+    def _calibrate(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:
+        services = self._bench_services
+        return CalibrateAction(self, self._values, services, self._manager, lambda: self._driver_facts, handle).run()
 
     def _write_report(self, file: Path) -> None:
         if self._values["write_report"]:
