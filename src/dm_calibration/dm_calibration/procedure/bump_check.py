@@ -76,11 +76,10 @@ class BumpCheck:
         """All actuators went `signal` away from rest, as in a degauss."""
         self._moved = np.maximum(self._moved, abs(signal))
 
-    def change(self, frame: MapTaken, pixel: float, interrupted: bool) -> str:
+    def change(self, frame: MapTaken, interrupted: bool) -> str:
         """How the reference frame `frame` differs from the one before it; "" = as it should.
 
         Args:
-            pixel: m.
             interrupted: somebody may have aligned the instrument since; a tilt does not matter then.
         """
         if self._last is None:
@@ -96,7 +95,7 @@ class BumpCheck:
                 f"(bump.tilt_max {options.tilt_max * 1e6:.2f} um)"
             )
         shift = math.dist(frame.centre, self._last.centre)
-        if options.shift_max and shift > max(options.shift_max, _WANDER_PX * pixel):
+        if options.shift_max and shift > max(options.shift_max, _WANDER_PX * frame.record.pitch):
             return (
                 f"the mirror moved by {shift * 1e3:.3f} mm on the map since {last.label} "
                 f"(bump.shift_max {options.shift_max * 1e3:.3f} mm)"

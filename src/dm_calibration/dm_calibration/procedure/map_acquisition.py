@@ -79,30 +79,22 @@ class MapAcquisition:
             MeasurementError: no try gave one.
             Refusal: a reference frame shows that the mirror was bumped, and another map of it does too.
         """
-        taken = self._taken(label, step, number, applied)
-        self._note(taken)
-        self._bump.take(taken)
-        self._swung = False
-
-    def _taken(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
         for attempt in range(self._options.measure_retries + 1):
             self._checkpoint()
             try:
-                measured = self._measured(label)
+                taken = self._map(label, step, number, applied)
                 break
             except MeasurementError as error:
                 if attempt == self._options.measure_retries:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
-        taken = self._as_event(label, step, number, applied, measured)
-        if step.kind is StepKind.REFERENCE:
-            suspicion = self._bump.change(taken, measured.pitch, self._swung)
-            if suspicion:  # a bad map, or a mirror that stands otherwise: another map tells
-                measured = self._measured(label)
-                taken = self._as_event(label, step, number, applied, measured)
-                if suspicion := self._bump.change(taken, measured.pitch, self._swung):
-                    self._stop_bumped(label, suspicion)
-        return taken
+        if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._swung):
+            taken = self._map(label, step, number, applied)  # bad, or the mirror stands otherwise: this one tells
+            if suspicion := self._bump.change(taken, self._swung):
+                self._stop_bumped(label, suspicion)
+        self._note(taken)
+        self._bump.take(taken)
+        self._swung = False
 
     def _stop_bumped(self, label: str, suspicion: str) -> None:
         """End the run; what was measured since the last good reference frame is in doubt."""
@@ -121,7 +113,11 @@ class MapAcquisition:
             "doubt; put the mirror back and start again to go on from the last good reference frame",
         )
 
-    def _as_event(self, label: str, step: Step, number: int, applied: Floats, measured: Measurement) -> MapTaken:
+    def _map(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
+        """A map that can be compared with the others."""
+        measured = self._bench.measure(label)
+        self._guard()
+        check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
         if self.outcome.setup is None:
             self._note(Setup.of(measured))
         assert step.signals is not None
@@ -140,13 +136,6 @@ class MapAcquisition:
             metres = self._mirror.working_radius / measured.radius_px
             centre = (measured.centre[0] * metres, measured.centre[1] * metres)
         return MapTaken(record, measured.radius > 0.0, centre)
-
-    def _measured(self, label: str) -> Measurement:
-        """A map that can be compared with the others."""
-        measured = self._bench.measure(label)
-        self._guard()
-        check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
-        return measured
 
 
 def check_comparable(

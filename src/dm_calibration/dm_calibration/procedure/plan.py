@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
-from itertools import chain
 
 import numpy as np
 
@@ -99,12 +98,8 @@ class Plan:
 
     kind: PlanKind
     steps: tuple[Step, ...]
-    remarks: tuple[str, ...] = field(default=())
+    remarks: tuple[str, ...] = ()
     ends: frozenset[int] = frozenset()
-
-    @property
-    def needs_model(self) -> bool:
-        return any(step.needs_model for step in self.steps)
 
 
 def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None) -> Plan:
@@ -142,18 +137,17 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     parts = [excitation(mirror, first), *(next_part(mirror, count, seed) for seed, count in enumerate(more, 1))]
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
-    ends = set[int]()
-    rows = (
-        zip(part.signals, part.dwell, part.settle_share, part.check, np.arange(len(part.check)) == 0, strict=True)
-        for part in parts
-    )
-    for k, (signals, dwell, share, check, begins) in enumerate(chain.from_iterable(rows)):
-        if begins and k:
+    ends, count = set[int](), 0
+    for part in parts:
+        if count:
             ends.add(len(steps))
-        kind = StepKind.CHECK if check else StepKind.EXCITATION
-        steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell), settle_share=float(share)))
-        if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:
-            steps.append(Step(f"reference {2 + k // HYSTERESIS_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
+        for signals, dwell, share, check in zip(part.signals, part.dwell, part.settle_share, part.check, strict=True):
+            count += 1
+            kind = StepKind.CHECK if check else StepKind.EXCITATION
+            steps.append(Step(f"{kind.value} {count}", kind, signals, dwell=float(dwell), settle_share=float(share)))
+            if count % HYSTERESIS_REFERENCE_EVERY == 0:
+                number = 1 + count // HYSTERESIS_REFERENCE_EVERY
+                steps.append(Step(f"reference {number}", StepKind.REFERENCE, mirror.rest))
     return Plan(PlanKind.HYSTERESIS, tuple(steps), ends=frozenset(ends))
 
 
@@ -189,12 +183,6 @@ def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)
     target = model.influence_sag @ (step.signals - mirror.rest)
     return replace(step, signals=limits.scaled(surfaces.solve_shape(target, model, mirror, inside)[0])[0])
-
-
-def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, surfaces.Surface]:
-    """`step` with the signals and nominal coefficients that `model` gives it, and the surface they come from."""
-    surface = surfaces.model_surface(step.label, model, mirror)
-    return Step(step.label, step.kind, surface.signals, surface.nominal), surface
 
 
 def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:

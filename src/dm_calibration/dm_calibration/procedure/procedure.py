@@ -13,10 +13,10 @@ import numpy as np
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.maps import CHECK, MapSet
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.influence.surfaces import LinearModel, model_surface
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
 from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
-from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, check_shape, solve_step
+from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, check_shape
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench
@@ -77,11 +77,6 @@ class Procedure:
         self._enough = enough
         self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)
 
-    @property
-    def complete(self) -> bool:
-        """Whether every state of the plan was measured or given up."""
-        return all(self._is_done(number, step) for number, step in enumerate(self._plan.steps))
-
     def run(self) -> Outcome:
         """Go through all steps that are still to be done.
 
@@ -93,15 +88,15 @@ class Procedure:
                 was bumped.
         """
         steps = self._plan.steps
-        if not self.complete:
-            if self.outcome.records:
-                self._go_on()
-            for number, planned in enumerate(steps):
-                if self._is_done(number, planned):
-                    continue
-                if number in self._plan.ends and self._enough(self.outcome):
-                    break
-                self._do(planned, number)
+        todo = [number for number, step in enumerate(steps) if not self._is_done(number, step)]
+        if todo and self.outcome.records:
+            self._go_on(todo[0])
+        for number, planned in enumerate(steps):
+            if self._is_done(number, planned):
+                continue
+            if number in self._plan.ends and self._enough(self.outcome):
+                break
+            self._do(planned, number)
         self._report(steps[-1].label, steps[-1].kind, len(steps))
         return self.outcome
 
@@ -119,10 +114,9 @@ class Procedure:
         elif (step := self._solved(planned, number)) is not None:
             self._measure_state(step, number, self._options.maps_per_state)
 
-    def _go_on(self) -> None:
+    def _go_on(self, done: int) -> None:
         """Begin a new segment after an interruption: degauss, and a map of the mirror at rest."""
         last = self.outcome.records[-1].label
-        done = next(number for number, step in enumerate(self._plan.steps) if not self._is_done(number, step))
         self._checkpoint()
         if self._plan.steps[0].kind is StepKind.DEGAUSS:
             self._report(f"degauss (resumed after {last})", StepKind.DEGAUSS, done)
@@ -160,7 +154,7 @@ class Procedure:
                 self._model = fit_influence(self._maps_before_solving(), self._options.fit, rings=self._mirror.rings)
             if step.kind is StepKind.CHECK:
                 return check_shape(step, self._model, self._mirror)
-            solved, surface = solve_step(step, self._model, self._mirror)
+            surface = model_surface(step.label, self._model, self._mirror)
         except TooFewMapsError as error:
             if step.kind is StepKind.CHECK:
                 return step
@@ -168,7 +162,7 @@ class Procedure:
             self._note(Dropped(number, reason, whole=True))
             return None
         self._note(Solved(surface.target, surface.remark))
-        return solved
+        return replace(step, signals=surface.signals, nominal=surface.nominal)
 
     def _maps_before_solving(self) -> MapSet:
         """The maps before the first solved shape: the same whether the run was interrupted after it or not."""
