@@ -144,11 +144,8 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
         "mirror/actuator_x": np.asarray(calibration.actuator_x, dtype=np.float64),
         "mirror/actuator_y": np.asarray(calibration.actuator_y, dtype=np.float64),
     }
-    for name in _POINTS:
-        columns[f"points/{name}"] = getattr(maps.points, name)
-    for column in fields(MapSet):
-        if column.name != "points":
-            columns[f"maps/{column.name}"] = getattr(maps, column.name)
+    columns |= {f"points/{name}": getattr(maps.points, name) for name in _POINTS}
+    columns |= {f"maps/{name}": getattr(maps, name) for name in MapSet.columns()}
     columns["maps/reference"] = maps.reference
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
@@ -158,13 +155,9 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
     }
     for figure in fields(InfluenceFit):
         value = getattr(fit, figure.name)
-        if figure.name == "points":
-            continue
-        if isinstance(value, np.ndarray):
+        if isinstance(value, np.ndarray) or figure.name == "reasons":
             columns[f"result/{figure.name}"] = value
-        elif figure.name == "reasons":
-            columns["result/reasons"] = value
-        else:
+        elif figure.name != "points":
             attributes[f"fit_{figure.name}"] = value
     if calibration.region_weights.size:
         columns["regions/weights"] = calibration.region_weights
@@ -190,7 +183,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         unknown = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
         before = {"moved_ns": unknown, "segment": unknown, "temperature": np.full(len(unknown), np.nan)}
         columns = {f"maps/{name}": value for name, value in before.items()} | dict(columns)
-        raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
+        raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
         # Nothing was known of the instrument before it was kept.
         attributes = {"reference_surface": "", "instrument_error": 0.0, "scale_error": 0.0, **attributes}

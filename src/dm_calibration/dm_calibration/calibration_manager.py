@@ -66,18 +66,15 @@ class CalibrationManager:
     def set_mirror(self, mirror: Mirror) -> str:
         """Take over the mirror. Returns why the calibration in use was withdrawn; "" = it was not."""
         with self._lock:
-            self.mirror = mirror
-            wrong = self.mismatch(self.in_use) if self.in_use else ""
-            if not wrong:
+            self.mirror, before = mirror, self.in_use
+            if before is None or not (wrong := self.mismatch(before)):
                 return ""
-            withdrawn = self.in_use.id if self.in_use else ""
             self.use(None)
-            return f"calibration {withdrawn} withdrawn: {wrong}"
+            return f"calibration {before.id} withdrawn: {wrong}"
 
     def mismatch(self, calibration: Calibration) -> str:
         """Why `calibration` does not belong to the mirror; "" = it does, or no mirror is known."""
-        mirror = self.mirror
-        if mirror is None:
+        if (mirror := self.mirror) is None:
             return ""
         of = calibration
         return mismatch(mirror, of.mirror_serial, of.fit.actuators, of.aperture_radius, self._aperture_tolerance())
@@ -143,26 +140,6 @@ class CalibrationManager:
         self.use(calibration)
         return calibration
 
-    def change(self, calibration_id: str, changed: Callable[[Calibration], Calibration]) -> Calibration:
-        """Change the calibration in use, in its file as well, and publish it again.
-
-        Args:
-            calibration_id: must be the one in use.
-            changed: makes the new calibration, with the same id and raw data, from the one in use.
-
-        Raises:
-            Refusal: another calibration is in use, or none.
-            StoreError: it could not be written; file and calibration in use are as they were.
-        """
-        with self._changing:
-            before = self._checked_in_use(calibration_id)
-            after = changed(before)
-            self.store.replace(after)
-            with self._lock:
-                self._checked_in_use(calibration_id)
-                self._put(after)
-            return after
-
     def _checked_in_use(self, calibration_id: str) -> Calibration:
         calibration = self.in_use
         if calibration is None:
@@ -177,24 +154,27 @@ class CalibrationManager:
     def add_recipes(self, calibration_id: str, book: RecipeBook) -> Calibration:
         """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
 
+        The calibration is changed in its file as well, and published again.
+
         Raises:
-            Refusal: another calibration is in use, or recipes of a mirror with another number of actuators.
+            Refusal: another calibration is in use, or none; or recipes of a mirror with another number of actuators.
             RecipeError: no recipes, or made from another condition.
-            StoreError: see :meth:`change`.
+            StoreError: it could not be written; file and calibration in use are as they were.
         """
         if not book.recipes:
             raise RecipeError("recipes: must hold at least one")
-
-        def changed(calibration: Calibration) -> Calibration:
-            count, has = len(book.recipes[0].effective), calibration.fit.actuators
+        with self._changing:
+            before = self._checked_in_use(calibration_id)
+            count, has = len(book.recipes[0].effective), before.fit.actuators
             if count != has:
-                raise Refusal(
-                    ErrorCode.INVALID_LENGTH,
-                    f"effective has {count} values: calibration {calibration.id} has {has} actuators",
-                )
-            return replace(calibration, recipes=calibration.recipes.merged(book))
-
-        return self.change(calibration_id, changed)
+                text = f"effective has {count} values: calibration {before.id} has {has} actuators"
+                raise Refusal(ErrorCode.INVALID_LENGTH, text)
+            after = replace(before, recipes=before.recipes.merged(book))
+            self.store.replace(after)
+            with self._lock:
+                self._checked_in_use(calibration_id)
+                self._put(after)
+            return after
 
     def keep(self, calibration: Calibration) -> Path:
         """Store `calibration` and read it back; one that is there already, whole, stays as it is. Returns its file.

@@ -156,11 +156,9 @@ class InterferometerNode(ManagedNode):
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""
         try:
             surface, measured = self._read(path)
-        except CodedError as error:
-            self._warn_of_file(str(error))
-            return
         except Exception as error:  # whatever one file does, the next one must be taken
-            self._warn_of_file(f"{path}: {type(error).__name__}: {error}")
+            known = isinstance(error, CodedError)
+            self._warn_of_file(str(error) if known else f"{path}: {type(error).__name__}: {error}")
             return
         # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
         before = self._published.pop(str(path), None)
