@@ -127,10 +127,10 @@ def test_actuators_that_stick_are_named(
     assert set(verdict.comparison.displaced) == set(stuck)
     for actuator in stuck:
         wanted = settled.effective[actuator]
-        assert verdict.comparison.displaced[actuator] == pytest.approx(-wanted, abs=0.01)
+        assert verdict.comparison.displaced[actuator].more == pytest.approx(-wanted, abs=0.01)
         assert f"actuator {actuator + 1} stands at " in verdict.reason
         assert f"instead of {wanted:+.2f}, as if it were dead" in verdict.reason or abs(wanted) < 0.1
-        assert verdict.comparison.probability[actuator] > 0.99
+        assert verdict.comparison.displaced[actuator].probability > 0.99
 
 
 @pytest.mark.parametrize("other", [0.0, 0.02])

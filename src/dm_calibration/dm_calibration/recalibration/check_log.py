@@ -1,11 +1,11 @@
 """The log of checks beside a calibration, ``<id>.checks.csv``: what each later map has shown of it."""
 
-from __future__ import annotations
-
 import csv
 import math
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any, Self
 
 from dm_calibration.recalibration.drift import Comparison, Drift
 
@@ -37,14 +37,11 @@ class Check:
     offset_drift: float
 
     @classmethod
-    def of(cls, stamp_ns: int, accepted: bool, shown: Comparison, drift: Drift) -> Check:
+    def of(cls, stamp_ns: int, accepted: bool, shown: Comparison, drift: Drift) -> Self:
         """The check of a map taken at `stamp_ns`, and the drift as it is used after it."""
         gain, actuator = drift.largest_gain
         departure = shown.max_zernike, shown.rms, shown.surprise
         return cls(1e-9 * stamp_ns, int(accepted), *departure, gain, actuator + 1, drift.offset_rms)
-
-
-NAMES = tuple(item.name for item in fields(Check))
 
 
 def append_check(file: Path, check: Check) -> None:
@@ -53,7 +50,7 @@ def append_check(file: Path, check: Check) -> None:
     with file.open("a", newline="") as stream:
         writer = csv.writer(stream)
         if new:
-            writer.writerow(NAMES)
+            writer.writerow(item.name for item in fields(Check))
         writer.writerow(astuple(check))
 
 
@@ -64,12 +61,9 @@ def read_checks(file: Path) -> list[Check]:
         lines = file.read_text(errors="replace").splitlines()
     except OSError:
         return []
+    kinds: list[Any] = [item.type for item in fields(Check)]
     for row in csv.reader(lines[1:]):
-        try:
-            values = [float(value) for value in row]
-        except ValueError:
-            continue
-        if len(values) == len(NAMES) and all(map(math.isfinite, values)):
-            named = dict(zip(NAMES, values, strict=True))
-            found.append(Check(**named | {name: int(named[name]) for name in ("accepted", "actuator")}))  # type: ignore[arg-type]
+        with suppress(ValueError):
+            check = Check(*(kind(value) for kind, value in zip(kinds, row, strict=True)))
+            found += [check] if all(map(math.isfinite, astuple(check))) else []
     return sorted(found, key=lambda check: check.time)

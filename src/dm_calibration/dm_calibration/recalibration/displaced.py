@@ -10,6 +10,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.quality import NO_RESPONSE
 from dm_calibration.procedure.forecast import typical_response
+from dm_calibration.recalibration.drift import Displaced
 from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
 
@@ -46,9 +47,8 @@ def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -
 
 def displaced_actuators(
     innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: NDArray[np.bool_]
-) -> tuple[dict[int, float], dict[int, float]]:
-    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares; and
-    the probability of each.
+) -> dict[int, Displaced]:
+    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares.
 
     Args:
         gain: (R, N) per unit of effective signal, see :func:`visible_gain`.
@@ -70,11 +70,12 @@ def displaced_actuators(
     size = np.abs(amounts)
     # One without a response that moved so little is rather another shape than a bump that is not well known.
     order = [int(k) for k in np.argsort(-size) if size[k] >= TELLING_SIGNAL or not silent[found[k]]]
-    probability = {}
+    displaced = {}
     for k in order:
         of_this = left + columns[:, found[k]] * amounts[k]
-        probability[found[k]] = float(_probability(columns, power, of_this, silent)[found[k]])
-    return {found[k]: float(amounts[k]) for k in order}, probability
+        probability = _probability(columns, power, of_this, silent)[found[k]]
+        displaced[found[k]] = Displaced(float(amounts[k]), float(probability))
+    return displaced
 
 
 def _probability(columns: Floats, power: Floats, white: Floats, silent: NDArray[np.bool_]) -> Floats:
@@ -112,11 +113,7 @@ def displacement(
 
 
 def described(
-    displaced: Mapping[int, float],
-    probability: Mapping[int, float],
-    expected: Floats,
-    given_up: NDArray[np.bool_],
-    silent: NDArray[np.bool_],
+    displaced: Mapping[int, Displaced], expected: Floats, given_up: NDArray[np.bool_], silent: NDArray[np.bool_]
 ) -> str:
     """What a map that disagrees shows, where actuators should stand at `expected` (N,).
 
@@ -127,7 +124,7 @@ def described(
     if not displaced:
         return "bad map, or the mirror has changed"
     shown, faults = list[str](), ""
-    for actuator, more in displaced.items():
+    for actuator, (more, probability) in displaced.items():
         stands = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
         if silent[actuator]:
             stands = "moves, which showed no response in the calibration"
@@ -136,9 +133,9 @@ def described(
         else:
             faults += (fault := _fault(expected[actuator], more))
             stands += fault
-        shown.append(f"actuator {actuator + 1} {stands} ({probability[actuator]:.0%})")
+        shown.append(f"actuator {actuator + 1} {stands} ({probability:.0%})")
     found, numbers = ", ".join(shown), sorted(displaced)
-    if min(probability.values()) < SURE:
+    if min(one.probability for one in displaced.values()) < SURE:
         return found
     if given_up[numbers].any():
         return f"{found}; ./dm check --forget takes it back"
@@ -150,21 +147,19 @@ def described(
     return f"{found}; ./dm check {without} goes on without what does not move"
 
 
-def worst_elsewhere(
-    displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats, zernike: Floats
-) -> float:
+def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:
     """Largest coefficient error of any other shape by actuators that stay where a map shows them, m.
 
     One that stays where it is errs by as much as it is asked to move: at the far end of the range by most.
 
     Args:
-        displaced, probability: as :func:`displaced_actuators` finds them; those that are not sure do not count.
+        displaced: as :func:`displaced_actuators` finds them; those that are not sure do not count.
         expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
         zernike: (K, N) m per unit of effective signal.
     """
     furthest = np.zeros(len(expected))
-    for actuator, more in displaced.items():
-        if probability[actuator] >= SURE:
+    for actuator, (more, probability) in displaced.items():
+        if probability >= SURE:
             furthest[actuator] = 1.0 + abs(expected[actuator] + more)
     return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
 

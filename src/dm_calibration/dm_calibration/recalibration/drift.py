@@ -1,6 +1,7 @@
 """What maps that came later have shown of a calibrated mirror."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_solve
@@ -135,6 +136,16 @@ class Drift:
         return self.trust * float(np.linalg.norm(self.figure))
 
 
+class Displaced(NamedTuple):
+    """An actuator that stands elsewhere: by how much effective signal, and how probable that is.
+
+    Against any other actuator and against a map that is bad all over.
+    """
+
+    more: float
+    probability: float
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """A map against its prediction.
@@ -144,17 +155,15 @@ class Comparison:
         rms: m rms of the difference in sag, piston and tilt removed.
         surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
             all values, and the largest single one over the largest to be expected of so many.
-        displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
-            the worst first, where a few of them explain it: one that sticks, say.
-        probability: {index: of each of them, against any other actuator and against a map that is bad all over}.
+        displaced: by index, the actuators that the difference comes from, the worst first, where a few of them explain
+            it: one that sticks, say.
     """
 
     max_zernike: float
     rms: float
     surprise: float
     updated: Drift
-    displaced: dict[int, float]
-    probability: dict[int, float]
+    displaced: dict[int, Displaced]
 
 
 def surprise_of(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:

@@ -143,7 +143,8 @@ class DriftFilter:
         prior, design, factor = seen.prior, seen.design, seen.factor
         innovation = seen.shown - seen.predicted - seen.warm
         shared = prior @ design.T
-        gain, offset, thermal, crept = self._parts(shared @ cho_solve(factor, innovation))
+        ends = np.cumsum((self._fit.actuators, self.reduction.size, 1 + self.reduction.size))
+        gain, offset, thermal, crept = np.split(shared @ cho_solve(factor, innovation), ends)
         # Joseph form: symmetric and positive whatever the rounding.
         kalman = cho_solve(factor, shared.T).T
         left = np.eye(len(prior)) - kalman @ design
@@ -173,15 +174,13 @@ class DriftFilter:
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
             ),
         )
-        displaced, probability = displaced_actuators(innovation, self._visible, factor, self._silent)
         departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
             surprise=surprise_of(innovation, seen.expected, factor),
             updated=updated,
-            displaced=displaced,
-            probability=probability,
+            displaced=displaced_actuators(innovation, self._visible, factor, self._silent),
         )
 
     def give_up(
@@ -206,12 +205,6 @@ class DriftFilter:
                 )
             stuck[actuator] = at[actuator] + more
         return replace(drift, stuck=stuck)
-
-    def _parts(self, values: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Gains, figure, what temperature does and creep, in `values` (N + 3 R + 1, ...)."""
-        ends = np.cumsum((self._fit.actuators, self.reduction.size, 1 + self.reduction.size))
-        gain, offset, thermal, crept = np.split(values, ends)
-        return gain, offset, thermal, crept
 
     def _at(self, drift: Drift, stamp_ns: int) -> Drift:
         """`drift` as expected at `stamp_ns`, still with its own stamp: creep fades, and all is known less well."""

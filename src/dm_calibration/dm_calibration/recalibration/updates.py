@@ -185,7 +185,7 @@ class RecalibrationManager:
             comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
-            found = comparison.displaced, comparison.probability, updates.reached(settled.effective)
+            found = comparison.displaced, updates.reached(settled.effective)
             worst = max(comparison.max_zernike, worst_elsewhere(*found, calibration.fit.influence_zernike))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
