@@ -16,6 +16,7 @@ from dm_calibration.map_files.surface_map import (
 
 #: magic: (format, header size in bytes)
 HEADERS = {0x881B036F: (1, 834), 0x881B0370: (2, 834), 0x881B0371: (3, 4096)}
+SMALLEST = min(size for _format, size in HEADERS.values())
 
 _FIELDS = {
     "magic": (0, ">I"),
@@ -55,18 +56,14 @@ def is_dat(start: bytes) -> bool:
 
 
 def read_header(content: bytes) -> dict[str, Any]:
-    """Return the header fields by name, checked for agreement with each other.
+    """The header fields by name, of a file that :func:`is_dat`.
 
     Raises:
         MapFileError: too short, or magic number, format and header size do not belong together.
     """
-    smallest = min(size for _format, size in HEADERS.values())
-    if len(content) < smallest:
-        raise MapFileError(f"file length = {len(content)} bytes: a .dat header alone has at least {smallest}")
+    if len(content) < SMALLEST:
+        raise MapFileError(f"file length = {len(content)} bytes: a .dat header alone has at least {SMALLEST}")
     header = {name: struct.unpack_from(code, content, offset)[0] for name, (offset, code) in _FIELDS.items()}
-    if header["magic"] not in HEADERS:
-        known = ", ".join(f"0x{magic:08X}" for magic in HEADERS)
-        raise MapFileError(f"magic number = 0x{header['magic']:08X}: must be one of {known}")
     expected = HEADERS[header["magic"]]
     if (header["format"], header["header_size"]) != expected:
         raise MapFileError(

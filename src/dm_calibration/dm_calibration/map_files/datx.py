@@ -137,11 +137,11 @@ def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> 
             node = None
     if node is None:
         return {}
-    found: dict[str, Any] = {}
-    for name in node.attrs:
-        if not name.endswith((":Unit", ":Converter")):
-            found[name.removesuffix(":Value").rpartition(".")[2]] = np.asarray(node.attrs[name]).ravel()
-    return found
+    return {
+        name.removesuffix(":Value").rpartition(".")[2]: np.asarray(value).ravel()
+        for name, value in node.attrs.items()
+        if not name.endswith((":Unit", ":Converter"))
+    }
 
 
 def _extra_number(extra: dict[str, Any], name: str) -> float | None:
@@ -174,21 +174,13 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
         raise MapFileError(f"{surface.name}: Unit = '{unit}': must be Fringes or a length such as NanoMeters{remark}")
     scale_factor = _required(surface, "Interferometric Scale Factor")
     obliquity = _required(surface, "Obliquity Factor", _extra_number(extra, "Obliquity"), 1.0)
-    return (
-        check_factor("Interferometric Scale Factor", scale_factor)
-        * check_factor("Obliquity Factor", obliquity)
-        * wavelength
-    )
-
-
-def _converter_pitch(surface: h5py.Dataset, name: str) -> float | None:
-    """Parameters[1] of a converter, m per pixel."""
-    parameters = _converter(surface, name)
-    return None if parameters is None else check_pitch(parameters[1])
+    scale_factor = check_factor("Interferometric Scale Factor", scale_factor)
+    return scale_factor * check_factor("Obliquity Factor", obliquity) * wavelength
 
 
 def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
-    x, y = _converter_pitch(surface, "X Converter"), _converter_pitch(surface, "Y Converter")
+    converters = [_converter(surface, name) for name in ("X Converter", "Y Converter")]
+    x, y = (None if parameters is None else check_pitch(parameters[1]) for parameters in converters)
     if x is not None and y is not None and abs(x - y) > _SQUARE_TOLERANCE * x:
         raise MapFileError(f"{surface.name}: pixels of {x:g} m x {y:g} m: must be square")
     stated = check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)

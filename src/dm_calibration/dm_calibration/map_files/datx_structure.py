@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.surface_map import MapFileError, check_size, no_valid_pixels
+from dm_calibration.map_files.surface_map import MapFileError, check_size
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
@@ -72,7 +72,6 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.flo
 
     Raises:
         MapFileError: no table of numbers, or one that does not stand in the file as it is told.
-        NoValidPixelsError: every pixel is invalid.
     """
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
         raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
@@ -86,8 +85,6 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.flo
     if not math.isnan(no_data):
         with np.errstate(invalid="ignore"):
             invalid |= heights >= no_data
-    if invalid.all():
-        raise no_valid_pixels(heights.shape)
     heights[invalid] = math.nan
     return heights
 

@@ -16,7 +16,6 @@ from dm_calibration.map_files.surface_map import (
     check_pitch,
     check_size,
     check_wavelength,
-    no_valid_pixels,
 )
 
 CARD, BLOCK = 80, 2880
@@ -61,8 +60,6 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
     if stored.dtype.kind != "f" and "BLANK" in header:
         sag[stored == header["BLANK"]] = math.nan
     sag[~np.isfinite(sag)] = math.nan
-    if np.isnan(sag).all():
-        raise no_valid_pixels(sag.shape)
     check_heights(sag)
     wavelength = _real(header, "WAVELEN", 0.0)
     return SurfaceMap(
@@ -80,15 +77,8 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
 def fits_bytes(surface: SurfaceMap, instrument: str) -> bytes:
     """`surface` as a FITS file in m that :func:`parse_fits` reads back."""
     height, width = surface.sag.shape
-    cards: dict[str, Any] = {
-        "SIMPLE": "T",
-        "BITPIX": -64,
-        "NAXIS": 2,
-        "NAXIS1": width,
-        "NAXIS2": height,
-        "BUNIT": "'m       '",
-    }
-    cards |= {"WAVELEN": f"{surface.wavelength:.9E}", "PUPLSCAL": f"{surface.pitch or 0.0:.9E}"}
+    cards: dict[str, Any] = {"SIMPLE": "T", "BITPIX": -64, "NAXIS": 2, "NAXIS1": width, "NAXIS2": height}
+    cards |= {"BUNIT": "'m       '", "WAVELEN": f"{surface.wavelength:.9E}", "PUPLSCAL": f"{surface.pitch or 0.0:.9E}"}
     cards |= {"MAPCOL": surface.origin[0], "MAPROW": surface.origin[1], "INSTRUME": f"'{instrument:8}'"}
     lines = [f"{name:8}= {value:>20}".ljust(CARD) for name, value in cards.items()]
     header = "".join([*lines, "END".ljust(CARD)]).encode()

@@ -156,8 +156,15 @@ def check_size(width: int, height: int) -> int:
 
 
 def check_heights(sag: Floats) -> None:
-    """Raise MapFileError for heights that no surface in front of an interferometer has; `sag` may hold NaN."""
+    """Check heights, m, NaN = no data.
+
+    Raises:
+        MapFileError: no surface in front of an interferometer has such.
+        NoValidPixelsError: there is none.
+    """
     lowest, highest = float(np.fmin.reduce(sag, axis=None)), float(np.fmax.reduce(sag, axis=None))
+    if math.isnan(lowest):
+        raise _no_valid_pixels(sag.shape)
     if max(-lowest, highest) > HEIGHT_MAX:
         raise _outside("height", f"{lowest:g} to {highest:g} m", f"-{HEIGHT_MAX:g} to {HEIGHT_MAX:g} m")
 
@@ -215,9 +222,9 @@ def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> Flo
         block *= metres_per_count
         block[invalid] = math.nan
     if not valid:
-        raise no_valid_pixels(counts.shape)
+        raise _no_valid_pixels(counts.shape)
     return sag
 
 
-def no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:
+def _no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:
     return NoValidPixelsError(f"none of the {shape[1]} x {shape[0]} pixels is valid: the map holds no data")

@@ -15,7 +15,6 @@ from dm_calibration.map_files.surface_map import (
     check_heights,
     check_size,
     check_wavelength,
-    no_valid_pixels,
     sag_from_counts,
     sag_per_count,
     zygo_map,
@@ -162,8 +161,6 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
         raise MapFileError("data lines: some pixel is missing and another appears twice")
     sag = np.empty((height, width))
     sag.ravel()[pixel] = value
-    if not np.isfinite(sag).any():
-        raise no_valid_pixels(sag.shape)
     metres = XYZ_UNITS[unit]
     sag *= wavelength if metres is None else metres
     check_heights(sag)
