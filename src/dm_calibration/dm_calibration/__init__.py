@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,16 +13,11 @@ if TYPE_CHECKING:
     from dm_calibration.hysteresis.response_fit import identify_response
 
 __all__ = ["calibrate", "identify_response"]
+_FROM = {"calibrate": "dm_calibration.calibrator", "identify_response": "dm_calibration.hysteresis.response_fit"}
 
 
 def __getattr__(name: str) -> Any:
     # When it is asked for: the process that reads HDF5 files imports this package too, and must stay small.
-    if name == "calibrate":
-        from dm_calibration.calibrator import calibrate
-
-        return calibrate
-    if name == "identify_response":
-        from dm_calibration.hysteresis.response_fit import identify_response
-
-        return identify_response
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _FROM:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_FROM[name]), name)
