@@ -40,7 +40,7 @@ def map_reader(file: ReferenceFile, folder: Path) -> Reader:
             found = read_map(path, xyz_unit=XYZ_UNIT)
         except MapFileError as error:
             return _refused(error)
-        f"{found.instrument}{found.serial}{found.part_name}".encode()  # they are published: must be text
+        f"{found.instrument}{found.serial}".encode()  # they are published: must be text
         return classify(file, whole, mutation, found), ""
 
     return read

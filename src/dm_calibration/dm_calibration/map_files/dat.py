@@ -43,7 +43,6 @@ _FIELDS = {
     "camera_height": (236, ">h"),
     "system_type": (238, ">h"),
     "system_serial": (242, ">H"),  # declared signed, but real serial numbers exceed 32767
-    "part_name": (258, "40s"),
     "system_error_subtracted": (302, ">h"),
 }
 
@@ -123,6 +122,5 @@ def parse_dat(content: bytes) -> SurfaceMap:
     width, height = header["width"], header["height"]
     counts = np.frombuffer(content, ">i4", width * height, offset).reshape(height, width)
     sag = sag_from_counts(counts, sag_per_count(header))
-    header["part_name"] = header["part_name"].split(b"\0")[0].decode("latin-1").strip(' "')
     software = _SOFTWARE.get(header["software"], f"software {header['software']}")
     return zygo_map(sag, header, "dat", f"{software}, system type {header['system_type']}")

@@ -92,7 +92,6 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
         origin=_origin(surface),
         instrument=software or "Mx",
         serial=_extra_text(extra, "System Serial Number"),
-        part_name=_extra_text(extra, "Part Name") or _extra_text(extra, "Part Number"),
         time_stamp=time_stamp if time_stamp else None,
         system_error_subtracted=_truth(extra.get("Subtract System Error")),
     )

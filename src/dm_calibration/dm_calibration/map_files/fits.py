@@ -69,7 +69,6 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
         origin=(int(_real(header, "MAPCOL", 0.0)), int(_real(header, "MAPROW", 0.0))),
         format="fits",
         instrument=str(header.get("INSTRUME", "")),
-        part_name=str(header.get("OBJECT", "")),
         time_stamp=_time(str(header.get("DATE-OBS", ""))),
     )
 

@@ -62,7 +62,6 @@ class SurfaceMap:
         format: "dat", "asc", "xyz" or "datx".
         instrument: software and system type, as told by the file.
         serial: serial number of the instrument; "" when not known.
-        part_name: name of the part; "" when not known.
         time_stamp: Unix time of the measurement, s; None when not known.
         system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
@@ -77,7 +76,6 @@ class SurfaceMap:
     origin: tuple[int, int] = (0, 0)
     instrument: str = ""
     serial: str = ""
-    part_name: str = ""
     time_stamp: float | None = None
     system_error_subtracted: bool | None = None
     piston_tilt_removed: bool = False
@@ -198,7 +196,6 @@ def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str)
         origin=(header["origin_x"], header["origin_y"]),
         instrument=instrument,
         serial=str(header["system_serial"]) if header["system_serial"] else "",
-        part_name=header["part_name"],
         time_stamp=float(header["time_stamp"]) if header["time_stamp"] > 0 else None,
         system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
     )

@@ -64,7 +64,7 @@ def read_header(content: bytes) -> tuple[dict[str, Any], bytes]:
     body = lines.pop().lstrip()
     if not body.startswith(b"#"):
         raise MapFileError(f"line {LINES + 1}: must be '#', the end of the header")
-    header: dict[str, Any] = {"part_name": lines[6].decode("latin-1").replace('"', "").strip()}
+    header: dict[str, Any] = {}
     for field, (line, position, kind, name) in _FIELDS.items():
         try:
             value = float(lines[line - 1].decode("latin-1").split()[position - 1])
