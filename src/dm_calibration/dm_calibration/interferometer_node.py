@@ -61,10 +61,8 @@ class InterferometerNode(ManagedNode):
             SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE)
         )
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
-        self._worker_services = [
-            WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file, INGEST_FILE),
-            WorkerService(self, Measure, "measure", self._on_measure, MEASURE),
-        ]
+        WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file, INGEST_FILE)
+        WorkerService(self, Measure, "measure", self._on_measure, MEASURE)
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror_radius = 0.5 * message.full_aperture_diameter

@@ -6,14 +6,14 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
 from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
 from dm_calibration.acquisition.inotify import ClosedFiles
-from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_trigger
+from dm_calibration.acquisition.trigger import PLACEHOLDER, run_trigger
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
@@ -161,11 +161,8 @@ class Acquisition:
     def _trigger(self, output: Path | None, timeout_s: float) -> int:
         """Run the trigger command; returns the middle of its run, ns."""
         began = self._now_ns()
-        try:
-            run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
-        except TriggerError:
-            self._check_stopped()
-            raise
+        run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
+        self._check_stopped()
         return (began + self._now_ns()) // 2
 
     def _check_stopped(self) -> None:
@@ -237,9 +234,8 @@ class Acquisition:
 
     def _run(self, watch: FolderWatch) -> None:
         period = min(max(self.settings.stable_time / 4, 0.02), 0.25)
-        closed = ClosedFiles(watch.folder)
         due = time.monotonic() + period
-        try:
+        with closing(ClosedFiles(watch.folder)) as closed:
             while not self._stop.is_set():
                 names = closed.wait(due - time.monotonic())
                 events = watch.closed(names, time.monotonic())
@@ -251,8 +247,6 @@ class Acquisition:
                         self._on_trouble(f"{event.path}: {event.refused}")
                     else:
                         self._hand_over(event)
-        finally:
-            closed.close()
 
     def _poll(self, watch: FolderWatch) -> list[FileEvent]:
         try:

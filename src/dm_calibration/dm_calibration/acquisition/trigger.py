@@ -27,7 +27,7 @@ class TriggerError(CodedError):
 
 
 def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, cancelled: threading.Event) -> None:
-    """Run the command (an argument list; no shell is involved) and wait for its end.
+    """Run the command (an argument list; no shell is involved) and wait for its end, or until it is `cancelled`.
 
     The command runs in its own process group, which is killed as a whole on time-out or cancellation.
 
@@ -50,7 +50,7 @@ def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, c
         try:
             while (status := process.poll()) is None:
                 if cancelled.wait(_POLL_S):
-                    raise TriggerError(f"trigger command {arguments[0]!r} was cancelled")
+                    return
                 if time.monotonic() >= deadline:
                     raise TriggerError(
                         f"trigger command {arguments[0]!r} did not end within {timeout_s:g} s{_tail(log)}"
