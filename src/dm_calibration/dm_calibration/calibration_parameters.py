@@ -100,12 +100,12 @@ def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     return from_values(FitOptions, values, method=method or FitOptions().method, epsilon=values["epsilon"] or None)
 
 
-def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:
-    """Options of a run from the node's parameters; `maps_per_state` 0 = 1."""
+def procedure_options(values: Mapping[str, Any], maps_per_state: int = 1) -> ProcedureOptions:
+    """Options of a run from the node's parameters."""
     return from_values(
         ProcedureOptions,
         values,
-        maps_per_state=maps_per_state or 1,
+        maps_per_state=maps_per_state,
         fit=fit_options(values),
         bump=from_values(BumpOptions, values, "bump.", hysteresis_allowance=values["hysteresis_allowance"]),
     )

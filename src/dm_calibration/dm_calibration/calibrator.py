@@ -173,11 +173,7 @@ def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Flo
 def fit_effective(
     maps: MapSet, hysteresis: HysteresisFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
 ) -> InfluenceFit:
-    """The influence function of `maps`, of effective signals when hysteresis is known.
-
-    Raises:
-        As :func:`~dm_calibration.influence.fit.fit_influence`.
-    """
+    """The influence function of `maps`, of effective signals when hysteresis is known; raises as `fit_influence`."""
     if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
     fit = fit_influence(effective_maps(maps, hysteresis.law), options, rings=mirror.rings, exclude=exclude)

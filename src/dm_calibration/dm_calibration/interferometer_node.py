@@ -26,8 +26,9 @@ from dm_calibration.acquisition.acquisition import Acquisition, measured_ns
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings, too_large
 from dm_calibration.acquisition.reference_surface import corrections
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
-from dm_calibration.interferometer_parameters import PARAMETERS, configure, ingest_settings
+from dm_calibration.interferometer_parameters import PARAMETERS, configure
 from dm_calibration.map_files import MapFileError, SurfaceMap
+from dm_calibration.optics.orientation import Orientation
 from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
@@ -36,6 +37,7 @@ from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService
+from dm_common.values import from_values
 
 
 class InterferometerNode(ManagedNode):
@@ -172,7 +174,15 @@ class InterferometerNode(ManagedNode):
         return self._ingest.read(path, self._settings())
 
     def _settings(self) -> IngestSettings:
-        return ingest_settings(self._values, self._mirror_radius, self._reference)
+        values = self._values
+        return from_values(
+            IngestSettings,
+            values,
+            orientation=from_values(Orientation, values, "orientation."),
+            mirror_radius=self._mirror_radius,
+            aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
+            reference=self._reference,
+        )
 
     def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
         if self.active:

@@ -75,17 +75,3 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
     folder = Path(values["watch_folder"]).expanduser() if values["watch_folder"] else None
     settings = from_values(AcquisitionSettings, values, folder=folder)
     return settings, load_reference(path, unit, *expected) if path else None
-
-
-def ingest_settings(
-    values: Mapping[str, Any], mirror_radius: float = 0.0, reference: SurfaceMap | None = None
-) -> IngestSettings:
-    """What maps are read with, of a mirror of `mirror_radius`, m; 0 = not known."""
-    return from_values(
-        IngestSettings,
-        values,
-        orientation=from_values(Orientation, values, "orientation."),
-        mirror_radius=mirror_radius,
-        aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
-        reference=reference,
-    )

@@ -33,19 +33,10 @@ def outcome_of(
     settings: IngestSettings | None = None,
     hysteresis: bool = False,
 ) -> Outcome:
-    """The maps as if a run had measured them, in their order.
+    """The maps as if a run had measured them, in their order; the files of a folder in that of their names.
 
-    Args:
-        maps: see `Maps`; the files of a folder count in the order of their names.
-        commands: (M, N) normalised signals that stood at the mirror, one row for each map.
-        times: (M,) s at which the maps were taken; None = as the files say, else one second apart.
-        settings: how files and arrays are read; None = with the mirror's aperture in the centre of the map.
-        hysteresis: the commands show hysteresis: the last fifth of the maps tests the model found from the others.
-
-    Raises:
-        MapFileError, MapRejectedError, InsufficientDataError: a file or array is no good.
-        MeasurementError: a map cannot be compared with those before it.
-        ValueError: commands or times of another shape or not finite, or no map.
+    Args and errors as of :func:`~dm_calibration.calibrator.calibrate`. Where neither `times` nor the files tell when
+    maps were taken, they count as one second apart.
     """
     measured = _measured(maps, settings or IngestSettings(aperture_radius=mirror.working_radius))
     count = len(measured)
