@@ -95,12 +95,12 @@ class CalibrationManager:
             if calibration is not None and (reason := self._resting()):
                 raise Refusal(ErrorCode.NODE_INACTIVE, f"{calibration.id} is stored, but not used: {reason}")
             self._put(calibration)
-        if calibration is None or before is None or calibration.promise <= CLEARLY_WORSE * before.promise:
-            return ""
-        return (
-            f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
-            f"{in_nanometres(before.promise)} (load_calibration brings that back)"
-        )
+        if calibration is not None and before is not None and calibration.promise > CLEARLY_WORSE * before.promise:
+            return (
+                f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
+                f"{in_nanometres(before.promise)} (load_calibration brings that back)"
+            )
+        return ""
 
     def _put(self, calibration: Calibration | None) -> None:
         """Take `calibration` in use; the lock must be held."""
