@@ -11,7 +11,7 @@ from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_controller.planning.fast_path import EXACT, PreparedInverse
-from example_hysteresis import lagging, plays, rich
+from example_hysteresis import fading, lagging, plays, rich
 
 ACTUATORS = 37
 
@@ -23,7 +23,7 @@ def fine(law: HysteresisModel) -> HysteresisModel:
     return replace(law, play_radius=radius, play_weight=weight)
 
 
-LAWS = [plays(), plays(0.01), fine(rich()), fine(rich(0.0)), fine(lagging())]
+LAWS = [plays(), plays(0.01), fine(rich()), fine(rich(0.0)), fine(lagging()), fine(fading())]
 
 
 def history(law: HysteresisModel, seed: int) -> HysteresisState:

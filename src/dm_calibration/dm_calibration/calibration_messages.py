@@ -28,7 +28,10 @@ _RANGE = ("method", "actuators", "signal_min", "signal_max")
 _FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")
 _MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 #: Arrays of a hysteresis model that the message has under the same names.
-_LAW = ("play_radius", "play_weight", "creep_time", "creep_spectrum", "lag_spectrum", "crept", "creep_covariance")
+_LAW = (
+    *("play_radius", "play_weight", "fading_rate", "fading_weight"),
+    *("creep_time", "creep_spectrum", "lag_spectrum", "crept", "creep_covariance"),
+)
 
 
 def driver_facts(message: MirrorInfo) -> dict[str, Any]:

@@ -10,13 +10,13 @@ from dm_calibration.hysteresis.features import (
     creep_blocks,
     creep_states,
     fading_changes,
-    fading_feature,
+    fading_features,
     own_slopes,
     padded_slope,
     weights_of,
 )
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.messages import hysteresis_model_from
 
@@ -28,11 +28,13 @@ def test_small_changes_of_the_slope_are_found() -> None:
     signals = rng.uniform(-1.0, 1.0, (300, ACTUATORS))
     common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
     true = common * (1.0 + 0.05 * rng.standard_normal(common.shape))
-    values = WEIGHT * fading_feature(signals, DuhemOperator(true))[:, 0]
-    columns = np.concatenate((fading_feature(signals, DuhemOperator(common)), fading_changes(signals, common)), axis=1)
+    values = WEIGHT * fading_features(signals, FadingHysteresis(true))[:, 0]
+    columns = np.concatenate(
+        (fading_features(signals, FadingHysteresis(common)), fading_changes(signals, common)), axis=1
+    )
     weights = np.column_stack([np.linalg.lstsq(columns[..., n], values[:, n], rcond=None)[0] for n in range(ACTUATORS)])
     found = own_slopes(common, weights[0], weights[1:])
-    left = WEIGHT * fading_feature(signals, DuhemOperator(found))[:, 0] - values
+    left = WEIGHT * fading_features(signals, FadingHysteresis(found))[:, 0] - values
     assert np.abs(left).max() < 0.1 * np.abs(WEIGHT * columns[:, 0] - values).max()
 
 
@@ -83,7 +85,11 @@ def test_slopes_and_lags_of_each_actuator_come_back_from_the_message(own: bool) 
     weight = np.full(ACTUATORS, WEIGHT) if own else WEIGHT
     lag = np.full((ACTUATORS, 4), 2.0) if own else np.full(4, 2.0)
     law = HysteresisModel(
-        np.zeros(1), play, slope if own else common, weight, 0.01, CREEP_TIMES, lag_spectrum=lag, creep_slope=-0.1
+        *(np.zeros(1), play, slope if own else common, weight, 0.01, CREEP_TIMES),
+        lag_spectrum=lag,
+        creep_slope=-0.1,
+        fading_rate=np.array([1.0, 3.0]),
+        fading_weight=np.arange(6.0).reshape(2, 3) * (np.ones((ACTUATORS, 1, 1)) if own else 1.0),
     )
     back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
     assert back is not None

@@ -180,7 +180,25 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
         _of_actuators("lag_spectrum", message.lag_spectrum, message.lags),
         message.creep_slope,
+        *_linear_fading(message, weight.shape[:-2]),
     )
+
+
+def _linear_fading(message: ActuatorHysteresis, actuators: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Rates (K,) and weights ([N,] K, P) of the linear Duhem operators.
+
+    Raises:
+        ValueError: fading_weight is not of these rates.
+    """
+    rate, weight = (np.array(value, dtype=np.float64) for value in (message.fading_rate, message.fading_weight))
+    if not rate.size:
+        return rate, np.zeros((0, 0))
+    shape = (*actuators, rate.size)
+    if not weight.size or weight.size % math.prod(shape):
+        raise ValueError(
+            f"hysteresis: fading_weight has {weight.size} values, must be {' x '.join(map(str, shape))} x P"
+        )
+    return rate, weight.reshape(*shape, -1)
 
 
 #: Fields of HysteresisState that a dm_msgs/ActuatorEstimate has under the same names.
@@ -209,9 +227,9 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
     if not count:
         return ActuatorEstimate(None, message.message)
     values = {name: np.array(getattr(message, name), dtype=np.float64) for name in _STATE}
-    for name in ("play", "crept", "lagged"):
+    for name in ("play", "fading", "crept", "lagged"):
         values[name] = values[name].reshape(count, -1)
-    for name, size in (("position", count), ("fading", count), ("crept_sigma", values["crept"].shape[1])):
+    for name, size in (("position", count), ("crept_sigma", values["crept"].shape[1])):
         values[name] = values[name].reshape(size)
     return ActuatorEstimate(HysteresisState(seconds(message.header.stamp), **values), message.message)
 

@@ -23,6 +23,12 @@ def rich(creep_rate: float = 0.01) -> HysteresisModel:
     return HysteresisModel(RADIUS, weight, np.array([1.6, 0.3]), -0.1, creep_rate, CREEP_TIMES)
 
 
+def fading() -> HysteresisModel:
+    """One of which a part fades at two rates, and follows the signal and its square."""
+    drive = np.array([[-0.05, 0.02, 0.01], [0.03, 0.01, -0.04]])
+    return replace(rich(), fading_rate=np.array([1.0, 6.0]), fading_weight=drive)
+
+
 def lagging() -> HysteresisModel:
     """One whose loops are wider for fast moves, and whose creep changes over the range."""
     return replace(rich(), lag_spectrum=np.full(7, 2.5), creep_slope=0.15)

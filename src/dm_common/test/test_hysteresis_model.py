@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.law_shape import normalised, slope_min, span
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from example_hysteresis import RADIUS, lagging, plays, rich
+from example_hysteresis import RADIUS, fading, lagging, plays, rich
 
 signal = st.floats(-1.0, 1.0)
-LAWS = [plays(), rich()]
+LAWS = [plays(), rich(), fading()]
 
 
 def drive(law: HysteresisModel, *signals: float) -> float:
@@ -49,6 +49,32 @@ def test_it_does_not_matter_how_a_way_is_cut(law: HysteresisModel, turns: list[f
 def test_the_hysteresis_matters() -> None:
     for law in LAWS:
         assert abs(drive(law, 1.0, 0.2) - drive(law, -1.0, 0.2)) > 0.02
+
+
+def test_what_fades_follows_its_equation() -> None:
+    law, signals = replace(fading(), duhem_slope=np.zeros(0)), (0.7, -0.9, 0.2)
+    operators = law.fading
+    assert operators is not None
+    states, z, u = np.zeros((1, 6)), np.zeros((2, 3)), 0.0
+    for signal in signals:
+        states = operators.move(states, np.array([u]), np.array([signal]))
+        steps = 4000
+        step = (signal - u) / steps
+        for number in range(steps):
+            middle = u + (number + 0.5) * step
+            rise = middle ** np.arange(3) * step
+            z = (z * (1.0 - 0.5 * law.fading_rate[:, None] * abs(step)) + rise) / (
+                1.0 + 0.5 * law.fading_rate[:, None] * abs(step)
+            )
+        u = signal
+    np.testing.assert_allclose(states[0], z.ravel(), atol=1e-5)
+    for there in (0.5, -0.4):  # on from there, either way: what it adds, and the slope of that
+        way = np.array([[np.sign(there - u)]])
+        value, slope = operators.along(states, np.array([u]), np.array([[there]]), way)
+        moved = [operators.move(states, np.array([u]), np.array([there + step])) for step in (-1e-6, 0.0, 1e-6)]
+        before, here, after = (operators.value(each)[0] for each in moved)
+        assert value[0, 0] == pytest.approx(here, abs=1e-12)
+        assert slope[0, 0] == pytest.approx((after - before) / 2e-6, abs=1e-6)
 
 
 def test_creep_follows_its_elements() -> None:

@@ -11,10 +11,10 @@ from dm_common.bounded import BoundedProgramme
 from dm_common.hysteresis.inverse import DAC_STEP, TOLERANCE, ConstrainedInverse, invert
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
-from example_hysteresis import lagging, plays, rich
+from example_hysteresis import fading, lagging, plays, rich
 
 STATIC = HysteresisModel(np.zeros(1), np.array([[1.0, 0.2, 0.05]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
-LAWS = [plays(), rich(), STATIC, lagging()]
+LAWS = [plays(), rich(), STATIC, lagging(), fading()]
 signal = st.floats(-1.0, 1.0)
 
 

@@ -102,6 +102,10 @@ def test_hysteresis_that_was_not_identified_and_one_that_makes_no_sense() -> Non
     assert hysteresis_model_from(ActuatorHysteresis()) is None
     with pytest.raises(ValueError, match="play_weight has 3 values, must be 2 x 1"):
         hysteresis_model_from(ActuatorHysteresis(play_radius=[0.0, 0.5], play_weight=[1.0, 2.0, 3.0], powers=1))
+    one = ActuatorHysteresis(play_radius=[0.0], play_weight=[1.0], powers=1, fading_rate=[1.0, 3.0])
+    one.fading_weight = [0.1, 0.2, 0.3]
+    with pytest.raises(ValueError, match="fading_weight has 3 values, must be 2 x P"):
+        hysteresis_model_from(one)
 
 
 ASTIGMATISM = tuple(2e-7 * (name == "astigmatism cos") for name in SPOKEN)

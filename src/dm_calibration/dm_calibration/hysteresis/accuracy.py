@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import PREISACH_AND_DUHEM
-from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
+from dm_calibration.hysteresis.features import crept, fading_features, play_features, relaxation
 from dm_calibration.hysteresis.segments import without
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.optics.zernike import PISTON_TILT
 
 #: The richest candidate, the slope of a typical fading operator, a typical creep rate.
@@ -96,7 +96,7 @@ def _features(signals: Floats, time: Floats, start: float) -> Floats:
     """(M, F, N), the creep of the signal among them; without the signal itself, whose weight is in the gains."""
     plays = play_features(signals, RICHEST.radius, RICHEST.powers)
     own_creep = crept(signals[:, None, :], time, start)
-    fading = fading_feature(signals, DuhemOperator(np.array([SLOPE])))
+    fading = fading_features(signals, FadingHysteresis(np.array([SLOPE])))
     static = np.concatenate((plays[:, 1:], fading), axis=1)
     return np.concatenate((static + CREEP_RATE * crept(static, time, start), own_creep), axis=1)
 

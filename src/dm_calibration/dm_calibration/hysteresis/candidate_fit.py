@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dm_calibration.hysteresis.features import CreepBlock, creep_blocks, crept, fading_feature, play_features
+from dm_calibration.hysteresis.features import CreepBlock, creep_blocks, crept, fading_features, play_features
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
 from dm_common import Floats
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
@@ -235,8 +235,8 @@ class CandidateProblem:
         features = self._plays + rate * self._plays_crept
         if not self.candidate.slopes:
             return features
-        operator = DuhemOperator(slope)
-        fading = self.run.in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
+        operator = FadingHysteresis(slope)
+        fading = self.run.in_parts(lambda part, start: fading_features(self.run.signals[part], operator))
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 

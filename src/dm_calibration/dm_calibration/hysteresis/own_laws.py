@@ -26,9 +26,10 @@ from dm_calibration.hysteresis.features import (
     PER_ELEMENT,
     creep_states,
     fading_changes,
-    fading_feature,
+    fading_features,
     own_slopes,
     padded_slope,
+    pattern_basis,
     play_values,
     spectrum_prior,
     weight_of,
@@ -37,23 +38,17 @@ from dm_calibration.hysteresis.features import (
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
 Rows = NDArray[np.bool_]
 
-#: Patterns that are kept of the prior.
-PATTERNS = 40
-#: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
-#: errors change by less than a tenth when any of these four is doubled or halved.
-AMPLITUDE, ORDER_POWER = 0.2, 3.0
-#: Correlation length and decay of the weights over the half-width.
-CORRELATION, DECAY = 0.5, 0.35
-#: Variance of the loading curve beside that of all play operators together.
-LOADING = 0.3
 #: Prior standard deviations of a Duhem operator's weight, and of that times the change of a coefficient of its slope.
 DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
+#: Rates of linear Duhem operators, per signal travelled, the powers of the signal that they follow, from 0 on, and the
+#: prior standard deviation of their weights.
+FADING_RATE, FADING_POWERS, FADING_WEIGHT = np.array([1.0, 3.0, 9.0]), 3, 0.1
 #: Prior of the creep spectrum: standard deviation relative to the common rate, and between actuators relative to that.
 SPECTRUM, SPECTRUM_SPREAD = 0.5, 0.3
 #: Its correlation over elements.
@@ -109,6 +104,11 @@ class OwnLaws:
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
+        self._linear = 0
+        if candidate.slopes:
+            linear = np.zeros((len(FADING_RATE), FADING_POWERS))
+            self._linear = linear.size
+            columns.append(self._fading(FadingHysteresis(rates=FADING_RATE, drive=linear)))
         self._plain = np.concatenate(columns, axis=1)
         count = signals.shape[1]
         self._between = _alike(count, SPREAD)
@@ -154,9 +154,11 @@ class OwnLaws:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""
         if not slope.size:
             return self._plain
-        operator, signals = DuhemOperator(slope), self.run.signals
-        fading = self.run.in_parts(lambda part, start: fading_feature(signals[part], operator))
-        return np.concatenate((self._plain, fading), axis=1)
+        return np.concatenate((self._plain, self._fading(FadingHysteresis(slope))), axis=1)
+
+    def _fading(self, operators: FadingHysteresis) -> Floats:
+        """(M, Z, N) values of Duhem operators along the run."""
+        return self.run.in_parts(lambda part, start: fading_features(self.run.signals[part], operators))
 
     def _fading_changes(self, slope: Floats) -> Floats:
         """(M, 2 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, A)."""
@@ -168,7 +170,8 @@ class OwnLaws:
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after some solutions in turn."""
         more = features.shape[1] - self._plain.shape[1]
-        sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(min(more, 1), DUHEM_WEIGHT)))
+        sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(self._linear, FADING_WEIGHT)))
+        sigma = np.concatenate((sigma, np.full(min(more, 1), DUHEM_WEIGHT)))
         sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
         root = np.diag(sigma)
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
@@ -195,6 +198,7 @@ class OwnLaws:
             powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(orders + 1)[order, : order + 1])
         play_weight = series @ powers[:, 1:]
         play_weight[:, 0, 0] += patterns[0]
+        fading = patterns[1 + count : 1 + count + self._linear].T.reshape(-1, len(FADING_RATE), FADING_POWERS)
         share, lag = np.maximum(creep[: len(CREEP_TIMES)].T, 0.0), creep[len(CREEP_TIMES) : -1].T
         mean = float(share.mean())
         share[:, :LAGS] += lag
@@ -209,6 +213,8 @@ class OwnLaws:
                 share / mean if mean else np.zeros(0),
                 lag_spectrum=-lag / mean if mean else np.zeros(0),
                 creep_slope=float(creep[-1].mean()),
+                fading_rate=FADING_RATE if self._linear else NONE,
+                fading_weight=fading if self._linear else NO_DRIVE,
             )
         )
 
@@ -276,18 +282,6 @@ class OwnLaws:
         found = weights_of(elements, left, gains, self._creep_root, self._creep_between)
         found[:count] += self._creep
         return found
-
-
-def pattern_basis(radius: Floats, orders: int) -> Floats:
-    """(R D, K) the strongest patterns of the prior over half-widths and orders, each of unit variance."""
-    away = np.abs(np.subtract.outer(radius, radius))
-    smooth = np.exp(-away / CORRELATION - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
-    smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is apart from the loops
-    smooth[0, 0] = LOADING
-    order = np.arange(1, orders + 1, dtype=np.float64) ** -ORDER_POWER
-    size, axes = np.linalg.eigh(AMPLITUDE**2 * np.kron(smooth, np.diag(order)))
-    strongest = np.argsort(size)[::-1][:PATTERNS]
-    return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
 
 
 def _alike(actuators: int, spread: float) -> tuple[float, float]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import horner
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
@@ -91,7 +91,7 @@ class Pieces:
             set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
         single: (D + 1, 1 or N, R) the same of each operator alone, in its own value.
         order: that sorts the law's operators; None = they are sorted.
-        duhem, duhem_weight: the Duhem operator, None = none; its weight () or (N,).
+        fading: what Duhem operators add; None = there are none.
     """
 
     def __init__(self, law: HysteresisModel) -> None:
@@ -110,8 +110,7 @@ class Pieces:
                         comb(power, low) * (-sign * self.radius) ** (power - low) * self.single[power]
                     )
         self.polynomial = self.polynomial.cumsum(axis=-1)
-        self.duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
-        self.duhem_weight = np.asarray(law.duhem_weight, dtype=np.float64)
+        self.fading = law.fading
         self.powers = np.arange(1.0, powers)[:, None]
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
@@ -132,9 +131,8 @@ class Pieces:
         rows = np.arange(len(wanted))
         laws = rows if self.polynomial.shape[2] > 1 else np.zeros_like(rows)
         at_onset = horner(self.polynomial[:, way, laws], onset) + waiting
-        if self.duhem is not None:
-            change = onset - state.signals[:, None]
-            at_onset += self.duhem_weight[..., None] * self.duhem.move(state.fading[:, None], change)
+        if self.fading is not None:
+            at_onset += self.fading.along(state.fading, state.signals, onset, sign[:, None])[0]
         still = sign[:, None] * (wanted[:, None] - at_onset)
         last = len(self.radius) - 1
         piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
@@ -165,10 +163,9 @@ class Pieces:
         for _ in range(ROUNDS_MAX):
             value = horner(polynomial, signals) + fixed
             slope = horner(derivative, signals) if len(derivative) > 1 else derivative[0]
-            if self.duhem is not None:
-                fading = self.duhem.move(state.fading, signals - state.signals)
-                value += self.duhem_weight * fading
-                slope = slope + self.duhem_weight * self.duhem.rise(fading, sign)
+            if self.fading is not None:
+                added, rise = self.fading.along(state.fading, state.signals, signals[:, None], sign[:, None])
+                value, slope = value + added[:, 0], slope + rise[:, 0]
             gap = value - wanted
             below = gap < 0.0
             low, high = np.where(below, signals, low), np.where(below, high, signals)
@@ -181,14 +178,6 @@ class Pieces:
 
 #: A law never changes, so what is worked out from it is kept.
 pieces = lru_cache(maxsize=8)(Pieces)
-
-
-def horner(coefficients: Floats, x: Floats) -> Floats:
-    """Polynomials with `coefficients` (D + 1, ...) by rising power, D > 0, at x (...)."""
-    total = coefficients[-1] * x + coefficients[-2]
-    for coefficient in coefficients[-3::-1]:
-        total = total * x + coefficient
-    return np.asarray(total)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.duhem import FULL_SWING, DuhemOperator
+from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.inverse import certain_reach
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
 #: Points of a branch of a loop.
 STEPS = 81
+#: Signals at which slopes are looked at, and turns before them.
+PLACES = 41
 
 
 def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> float:
@@ -23,34 +25,40 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> flo
     """
     order = np.argsort(law.play_radius)
     radius, weight = law.play_radius[order], law.play_weight[..., order, :]
-    signal, way = np.linspace(low, high, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
-    behind = np.where(way > 0.0, signal - low, high - signal)
-    value = signal - way * radius
+    signals, way = np.linspace(low, high, PLACES), np.array([1.0, -1.0])[:, None, None]
+    behind = np.where(way > 0.0, signals[:, None] - low, high - signals[:, None])
+    value = signals[:, None] - way * radius
     weight = weight[..., None, None, :, :]  # a row for each way and signal
     slope = np.zeros(np.broadcast_shapes(value.shape, weight.shape[:-1]))
     for power in range(weight.shape[-1], 0, -1):
         slope = slope * value + power * weight[..., power - 1]
-    slope = np.where(2.0 * radius <= behind, slope, 0.0)
-    smallest = np.cumsum(slope, axis=-1).min(axis=-2)  # (..., 2, R), of each number of operators that have set in
-    if law.duhem_slope.size:
-        smallest = smallest + _fading_slope(law, 2.0 * radius)
-    return float(smallest.min())
+    slope = np.cumsum(np.where(2.0 * radius <= behind, slope, 0.0), axis=-1)  # of each number that have set in
+    if law.fading is not None:
+        slope = slope + _fading_slope(law.fading, law.actuators or 1, signals, radius)
+    return float(slope.min())
 
 
-def _fading_slope(law: HysteresisModel, travelled: Floats) -> Floats:
-    """(N, 2, R) smallest slope of the fading part of each actuator, or of one, on both ways `travelled` (R,) after a
-    turn or later.
+def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:
+    """(N, 2, S, R) smallest slope of what fades at `signals` (S,), on both ways, at least 2 `radius` (R,) after a turn
+    that a full swing led to; infinite where no turn lies so far behind.
     """
-    duhem, actuators = DuhemOperator(law.duhem_slope), law.actuators or 1
-    weight, share = np.reshape(law.duhem_weight, (-1, 1, 1)), np.linspace(0.0, 1.0, STEPS)
+    count, step = len(signals), signals[1] - signals[0]
+    apart = np.minimum((2.0 * radius / step).astype(int), count - 1)
     smallest = []
-    for way in (1.0, -1.0):
-        furthest = duhem.move(np.zeros(actuators), np.full(actuators, -FULL_SWING * way))[:, None]
-        since, end = (duhem.move(furthest, way * np.tile(far, (actuators, 1))) for far in (travelled, [FULL_SWING]))
-        met = since[..., None] + (end - since)[..., None] * share
-        rise = duhem.rise(met.reshape(actuators, -1), np.full((actuators, 1), way)).reshape(met.shape)
-        smallest.append((weight * rise).min(axis=-1))
-    return np.stack(smallest, axis=1)
+    for way in (1, -1):
+        met = signals[::way]
+        states, at = np.zeros((actuators, fading.size)), np.full(actuators, met[0])
+        for end in (met[-1], met[0], met[-1]):
+            states, at = fading.move(states, at, np.full(actuators, end)), np.full(actuators, end)
+        slopes = np.full((count, count, actuators), np.inf)  # over steps since the turn, and signals
+        for turn in range(count):
+            there = np.full(actuators, met[turn])
+            onward = np.tile(met[turn:], (actuators, 1))
+            slope = fading.along(fading.move(states, at, there), there, onward, np.array([[float(way)]]))[1]
+            slopes[np.arange(count - turn), np.arange(turn, count)] = slope.T
+        later = np.minimum.accumulate(slopes[::-1], axis=0)[::-1]
+        smallest.append(later[apart][:, ::way])
+    return np.stack(smallest).transpose(3, 0, 2, 1)
 
 
 def span(law: HysteresisModel) -> Floats:

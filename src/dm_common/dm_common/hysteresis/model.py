@@ -7,7 +7,7 @@ the gains. Signals are normalised, so is the effective signal: it spans 2 over a
   Prandtl-Ishlinskii model ([16], section 2.4); higher powers make
   it a Preisach operator whose density over centre and half-width of the relays is learned: the relays
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
-* Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for hysteresis that fades.
+* Optionally Duhem operators (:mod:`~dm_common.hysteresis.duhem`), for hysteresis that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
   grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does. The first
   of them follow the signal by a spectrum of its own: what its loops add may lag behind, or creep, otherwise than the
@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis, horner
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
@@ -43,7 +43,7 @@ class HysteresisState:
         time: s, of the clock that commands are stamped with.
         signals: (N,) as applied.
         play: (N, R) values of the play operators.
-        fading: (N,) of the Duhem operator.
+        fading: (N, Z) of the Duhem operators.
         position: (N,) static effective signal: hysteresis without creep.
         crept: (N, J) what the creep elements have followed so far.
         crept_sigma: (J,) its standard deviation, in shapes of the whole range: 0 but where some were held unseen.
@@ -69,6 +69,8 @@ class HysteresisModel:
         play_weight: (R, D) weights of the powers 1 .. D of each play operator's value, or (N, R, D) for each actuator.
         duhem_slope: (A,) of the Duhem operator, or (N, 2, A) of each actuator, rising and falling; empty = none.
         duhem_weight: () or (N,) of the Duhem operator's value.
+        fading_rate: (K,) per signal travelled, of the linear Duhem operators; empty = none.
+        fading_weight: (K, P) or (N, K, P) of those that follow the powers 0 .. P - 1 of the signal.
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
         creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
@@ -90,20 +92,22 @@ class HysteresisModel:
     duhem_weight: float | Floats
     creep_rate: float
     creep_time: Floats
-    creep_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
+    creep_spectrum: Floats = field(default_factory=lambda: NONE)
     crept_at: float = 0.0
-    crept: Floats = field(default_factory=lambda: np.zeros(0))
-    creep_covariance: Floats = field(default_factory=lambda: np.zeros(0))
-    lag_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
+    crept: Floats = field(default_factory=lambda: NONE)
+    creep_covariance: Floats = field(default_factory=lambda: NONE)
+    lag_spectrum: Floats = field(default_factory=lambda: NONE)
     creep_slope: float = 0.0
+    fading_rate: Floats = field(default_factory=lambda: NONE)
+    fading_weight: Floats = field(default_factory=lambda: NO_DRIVE)
 
     def __post_init__(self) -> None:
         if self.play_radius.ndim != 1 or not self.play_radius.size:
             raise ValueError(f"play_radius has the shape {self.play_radius.shape}: must be a list of half-widths")
-        if self.play_weight.ndim not in (2, 3) or self.play_weight.shape[-2] != len(self.play_radius):
-            raise ValueError(
-                f"play_weight has the shape {self.play_weight.shape}: must be {len(self.play_radius)} rows"
-            )
+        for name, rows in (("play_weight", len(self.play_radius)), ("fading_weight", len(self.fading_rate))):
+            shape = getattr(self, name).shape
+            if len(shape) not in (2, 3) or shape[-2] != rows:
+                raise ValueError(f"{name} has the shape {shape}: must be {rows} rows")
         if self.creep_spectrum.size and self.creep_spectrum.shape[-1] != len(self.creep_time):
             raise ValueError(
                 f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {len(self.creep_time)} columns"
@@ -120,19 +124,19 @@ class HysteresisModel:
             raise ValueError(f"play_radius = {self.play_radius.min():g}: must not be negative")
         if not 0.0 <= self.creep_rate <= 0.2:
             raise ValueError(f"creep_rate = {self.creep_rate:g} per decade: must be 0 to 0.2")
-        if (self.creep_time <= 0.0).any():
-            raise ValueError(f"creep_time = {self.creep_time.min():g} s: must be positive")
+        for name in ("creep_time", "fading_rate"):
+            if (getattr(self, name) <= 0.0).any():
+                raise ValueError(f"{name} = {getattr(self, name).min():g}: must be positive")
 
     @classmethod
     def linear(cls, creep_rate: float = 0.0) -> HysteresisModel:
         """No hysteresis: but for creep of so much per decade the effective signal is the signal."""
-        none = np.zeros(0)
-        return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, creep_rate, CREEP_TIMES if creep_rate else none)
+        return cls(np.zeros(1), np.ones((1, 1)), NONE, 0.0, creep_rate, CREEP_TIMES if creep_rate else NONE)
 
     @cached_property
     def has_history(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
-        return bool((self.play_radius > 0.0).any()) or bool(self.duhem_slope.size) or self.creep_rate > 0.0
+        return bool((self.play_radius > 0.0).any()) or self.fading is not None or self.creep_rate > 0.0
 
     @property
     def in_use(self) -> float:
@@ -150,8 +154,11 @@ class HysteresisModel:
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     @cached_property
-    def _duhem(self) -> DuhemOperator | None:
-        return DuhemOperator(self.duhem_slope) if self.duhem_slope.size else None
+    def fading(self) -> FadingHysteresis | None:
+        """What Duhem operators add; None = there are none."""
+        if not (self.duhem_slope.size or self.fading_rate.size):
+            return None
+        return FadingHysteresis(self.duhem_slope, self.duhem_weight, self.fading_rate, self.fading_weight)
 
     @cached_property
     def creep_share(self) -> Floats:
@@ -182,18 +189,19 @@ class HysteresisModel:
 
     @property
     def _own(self) -> tuple[tuple[int, ...], ...]:
-        slope = self.duhem_slope.shape[:-2]
-        lag = self.lag_spectrum.shape[:-1]
-        return self.play_weight.shape[:-2], slope, np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1], lag
+        duhem = self.duhem_slope.shape[:-2], np.shape(self.duhem_weight), self.fading_weight.shape[:-2]
+        return self.play_weight.shape[:-2], *duhem, self.creep_spectrum.shape[:-1], self.lag_spectrum.shape[:-1]
 
     # --- states ---
 
     def demagnetised(self, actuators: int, time: float, middle: float = 0.0) -> HysteresisState:
         """The state after a degauss that ended at `middle`, long rested there."""
         play = np.full((actuators, len(self.play_radius)), middle)
+        fading = np.zeros((actuators, self.fading.size if self.fading is not None else 0))
         none, crept = np.zeros(actuators), np.zeros((actuators, len(self.creep_time)))
         lagged = np.full((actuators, len(self.lag_time)), middle)
-        state = HysteresisState(time, np.full(actuators, middle), play, none, none, crept, crept.sum(axis=0), lagged)
+        signals = np.full(actuators, middle)
+        state = HysteresisState(time, signals, play, fading, none, crept, crept.sum(axis=0), lagged)
         position = self._position(play, state.fading)
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
 
@@ -262,19 +270,12 @@ class HysteresisModel:
         column = signals[:, None]
         # Faster than np.clip for arrays of this size.
         play = np.minimum(np.maximum(state.play, column - self.play_radius), column + self.play_radius)
-        if self._duhem is None:
-            return play, state.fading
-        return play, self._duhem.move(state.fading, signals - state.signals)
+        fading = self.fading
+        return play, state.fading if fading is None else fading.move(state.fading, state.signals, signals)
 
     def _position(self, play: Floats, fading: Floats) -> Floats:
-        powers = self.play_weight.shape[-1]
-        total = play * self.play_weight[..., powers - 1]
-        for power in range(powers - 2, -1, -1):  # Horner: ((w3 p + w2) p + w1) p
-            total = (total + self.play_weight[..., power]) * play
-        result = total.sum(axis=1)
-        if self._duhem is not None:
-            result = result + self.duhem_weight * fading
-        return np.asarray(result)
+        total = (horner(np.moveaxis(self.play_weight, -1, 0), play) * play).sum(axis=1)
+        return np.asarray(total if self.fading is None else total + self.fading.value(fading))
 
     def scaled(self, factor: float | Floats) -> HysteresisModel:
         """The same law with effective signals `factor` times as large, a number or (N,)."""
@@ -286,6 +287,7 @@ class HysteresisModel:
             self,
             play_weight=factors[..., None, None] * self.play_weight,
             duhem_weight=duhem,
+            fading_weight=factors[..., None, None] * self.fading_weight,
             crept=factors * self.crept if self.crept.size else self.crept,
             lag_spectrum=factors[..., None] * self.lag_spectrum if self.lag_spectrum.size else self.lag_spectrum,
             creep_slope=self.creep_slope / float(np.mean(factors)),

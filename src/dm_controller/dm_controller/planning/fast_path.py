@@ -145,10 +145,9 @@ class PreparedInverse:
         curve = parts.polynomial
         first = horner(curve, begin) + waiting
         fading = None
-        if parts.duhem is not None:
-            start = np.broadcast_to(state.fading[:, None], begin.shape)
-            fading = parts.duhem.move(start, begin - state.signals[:, None])
-            first += parts.duhem_weight[..., None] * fading
+        if parts.fading is not None:
+            fading = parts.fading.along(state.fading, state.signals, begin, sign)
+            first += fading[0]
         if len(curve) == 2 and fading is None:
             slope = 1.0 / np.broadcast_to(curve[1], begin.shape)
             self._table = np.stack((begin, first, slope), axis=-1).reshape(-1, 3)
@@ -160,14 +159,14 @@ class PreparedInverse:
         places[:, 0] = -0.5 * APART  # nothing lies before the state itself
         self._places = (places + rows[:, None]).ravel()
 
-    def _cubics(self, parts: Pieces, begin: Floats, first: Floats, waiting: Floats, fading: Floats | None) -> Floats:
+    def _cubics(
+        self, parts: Pieces, begin: Floats, first: Floats, waiting: Floats, fading: tuple[Floats, Floats] | None
+    ) -> Floats:
         """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact."""
-        duhem, sign = parts.duhem, np.array([-1.0, 1.0])[:, None, None]
+        state, sign = self.state, np.array([-1.0, 1.0])[:, None, None]
         ends = np.array([[self._low], [self._high]])
         curve = parts.polynomial
         slopes = curve[1:] * parts.powers[:, :, None, None]
-        hysteresis = np.broadcast_to(self.state.fading[:, None], begin.shape)
-        change = begin - self.state.signals[:, None]
         # A piece ends where the next one begins, the last one at the limit.
         end, last = np.empty_like(begin), np.empty_like(begin)
         end[..., :-1], end[..., -1] = begin[..., 1:], ends
@@ -176,13 +175,10 @@ class PreparedInverse:
             horner(slopes, at) if len(slopes) > 1 else np.broadcast_to(slopes[0], at.shape).copy()
             for at in (begin, end)
         )
-        if duhem is not None and fading is not None:
-            after = np.empty_like(fading)
-            after[..., :-1] = fading[..., 1:]
-            after[..., -1:] = duhem.move(hysteresis[..., -1:], (ends - self.state.signals)[..., None])
-            last[..., -1] += parts.duhem_weight * after[..., -1]
-            steep_first += parts.duhem_weight[..., None] * duhem.rise(fading, sign)
-            steep_last += parts.duhem_weight[..., None] * duhem.rise(after, sign)
+        if parts.fading is not None and fading is not None:
+            after = parts.fading.along(state.fading, state.signals, end, sign)
+            last[..., -1] += after[0][..., -1]
+            steep_first, steep_last = steep_first + fading[1], steep_last + after[1]
         with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last
@@ -191,8 +187,8 @@ class PreparedInverse:
             middle = 0.5 * rise
             way = ((cube * middle + square) * middle + one) * middle
             error = horner(curve, begin + way) + waiting - first - middle
-            if duhem is not None:
-                error += parts.duhem_weight[..., None] * duhem.move(hysteresis, change + way)
+            if parts.fading is not None:
+                error += parts.fading.along(state.fading, state.signals, begin + way, sign)[0]
         cube[~(np.abs(error) <= EXACT)] = np.nan
         return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
 

@@ -40,6 +40,7 @@ COMPARED = (
     "hysteresis.play_weight",
     "hysteresis.duhem_slope",
     "hysteresis.duhem_weight",
+    "hysteresis.fading_weight",
     "hysteresis.creep_rate",
     "hysteresis.zernike_sigma",
 )
