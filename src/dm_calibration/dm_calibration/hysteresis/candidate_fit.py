@@ -23,7 +23,7 @@ from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_part
 from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 Rows = NDArray[np.bool_]
 
@@ -209,7 +209,7 @@ class CandidateProblem:
             return np.asarray(left[keep].ravel())
 
         low = np.concatenate((np.full(slopes, -30.0), [0.0]))
-        high = np.concatenate((np.full(slopes, 30.0), [0.2]))
+        high = np.concatenate((np.full(slopes, 30.0), [CREEP_RATE_MAX]))
         scale = np.concatenate((np.ones(slopes), [0.01]))
         found = least_squares(
             residual,

@@ -18,6 +18,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
 from dm_common.hysteresis import law_shape
+from dm_common.hysteresis.model import CREEP_RATE_MAX
 
 Rows = NDArray[np.bool_]
 
@@ -50,7 +51,7 @@ class Identification:
             of the run in turn; NaN = not predicted.
         scores: held-out error of each candidate relative to the best; that of the best before it, of a richer one that
             leaves hardly less in the maps it was fitted to.
-        refused: candidates that cannot be inverted, with the reason.
+        refused: candidates that cannot be inverted, or creep without bound, with the reason.
         quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
@@ -125,6 +126,9 @@ def identify(
         slope = law_shape.slope_min(whole.law, *reach)
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
+            return
+        if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
+            refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not tell its creep"
             return
         gain = size(best[2].residual) / size(whole.residual) if best else np.inf
         if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:

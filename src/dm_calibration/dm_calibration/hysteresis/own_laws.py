@@ -40,7 +40,7 @@ from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 Rows = NDArray[np.bool_]
 
@@ -208,7 +208,7 @@ class OwnLaws:
                 play_weight,
                 slope,
                 patterns[-1].copy() if slope.size else 0.0,
-                mean / PER_ELEMENT,
+                min(mean / PER_ELEMENT, CREEP_RATE_MAX),  # a law that creeps so much is not taken
                 CREEP_TIMES,
                 share / mean if mean else np.zeros(0),
                 lag_spectrum=-lag / mean if mean else np.zeros(0),

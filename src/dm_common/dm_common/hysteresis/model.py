@@ -30,6 +30,8 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis, horner
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
+#: The most creep per decade of time that a law may have.
+CREEP_RATE_MAX = 0.2
 #: How much more a request may err, where there is hysteresis, than the held-out moves of the calibration, which follow
 #: each other within seconds: requests after a degauss err 1.2 to 2.6 times as much as the same law does on those moves.
 IN_USE = 1.4
@@ -122,8 +124,8 @@ class HysteresisModel:
                 raise ValueError(f"{name} holds values that are not finite")
         if (self.play_radius < 0.0).any():
             raise ValueError(f"play_radius = {self.play_radius.min():g}: must not be negative")
-        if not 0.0 <= self.creep_rate <= 0.2:
-            raise ValueError(f"creep_rate = {self.creep_rate:g} per decade: must be 0 to 0.2")
+        if not 0.0 <= self.creep_rate <= CREEP_RATE_MAX:
+            raise ValueError(f"creep_rate = {self.creep_rate:g} per decade: must be 0 to {CREEP_RATE_MAX:g}")
         for name in ("creep_time", "fading_rate"):
             if (getattr(self, name) <= 0.0).any():
                 raise ValueError(f"{name} = {getattr(self, name).min():g}: must be positive")
