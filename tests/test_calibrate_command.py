@@ -139,8 +139,15 @@ class FakeClient:
     def calibrate(self, goal: Calibrate.Goal, show: Callable[[Any], None] = lambda _feedback: None) -> Calibrate.Result:
         if goal.dry_run:
             return Calibrate.Result(message="110 maps in about 158 s, moves then right to 2.7 nm; nothing was moved")
-        left = {"maps_left": 40, "time_left": 60.0, "expected_max_zernike": 2e-9}
-        for reached, rest in ((0.0, {}), (3.2e-9, left), (3.2e-9, {**left, "maps_left": 39}), (1.9e-9, {})):
+        most, left = {"maps_left": 344, "time_left": 319.0}, {"maps_left": 40, "time_left": 60.0}
+        left["expected_max_zernike"] = 2e-9
+        for reached, rest in (
+            (0.0, {}),
+            (11e-9, most),
+            (3.2e-9, left),
+            (3.2e-9, {**left, "maps_left": 39}),
+            (1.9e-9, {}),
+        ):
             show(Calibrate.Feedback(phase=Calibrate.Feedback.PHASE_HYSTERESIS, reached_max_zernike=reached, **rest))
         return Calibrate.Result(id="c1", maps=130, message="2 nm is reached: 1.9 nm", hysteresis_model="Preisach")
 
@@ -154,6 +161,7 @@ def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch
     lines = done.output.splitlines()
     assert lines[0] == "expected: 110 maps in about 158 s, moves then right to 2.7 nm"
     assert [line for line in lines if "so far" in line] == [
+        "calibration: right to 11 nm so far, its law is hardly found yet: less with it, 344 more maps at most (319 s)",
         "calibration: right to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
         "calibration: right to 1.9 nm so far",
     ]

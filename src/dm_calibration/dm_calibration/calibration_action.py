@@ -15,7 +15,7 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, step_times
+from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, left_of_one_map, step_times
 from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
@@ -113,8 +113,7 @@ class CalibrateAction:
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
-            known = taken or in_use is not None
-            guess = "" if known else f" if a map takes {guessed:g} s (none was taken yet)"
+            guess = "" if taken or in_use is not None else f" if a map takes {guessed:g} s (none was taken yet)"
             drawn = in_use is None or in_use.hysteresis is None
             time_text = f"{maps} maps in about {expected.duration:.0f} s{guess}"
             result.message = f"{time_text}{expected.accuracy(goal.until, drawn)}; nothing was moved"
@@ -212,7 +211,9 @@ class CalibrateAction:
         """Tell what the run has reached (m) after a part of so many maps, and what is left."""
         feedback = self._feedback
         feedback.reached_max_zernike = reached
-        self._end, feedback.expected_max_zernike = expected_end(self._plan, feedback.step, reached, self._goal.until)
+        law = left_of_one_map(self._manager.in_use, self._mirror)
+        step, until = feedback.step, self._goal.until
+        self._end, feedback.expected_max_zernike = expected_end(self._plan, step, reached, until, law)
         self._node.get_logger().info(f"{maps} maps: right to {reached * 1e9:.2f} nm")
 
     def _conclude(self, run: OpenRun, runs: UnfinishedRuns, enough: GoodEnough) -> None:

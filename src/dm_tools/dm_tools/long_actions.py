@@ -127,10 +127,13 @@ def reached_so_far(feedback: Any) -> str:
     if not feedback.reached_max_zernike > 0.0:
         return ""
     text = f"right to {in_nanometres(feedback.reached_max_zernike)} so far"
-    if feedback.maps_left:
-        expected = in_nanometres(feedback.expected_max_zernike)
-        text += f", {expected} expected after {feedback.maps_left} more maps ({feedback.time_left:.0f} s)"
-    return text
+    if not feedback.maps_left:
+        return text
+    if not feedback.expected_max_zernike > 0.0:
+        time = f"{feedback.time_left:.0f} s"
+        return f"{text}, its law is hardly found yet: less with it, {feedback.maps_left} more maps at most ({time})"
+    expected = in_nanometres(feedback.expected_max_zernike)
+    return f"{text}, {expected} expected after {feedback.maps_left} more maps ({feedback.time_left:.0f} s)"
 
 
 def converge_step(feedback: Any) -> str:

@@ -30,6 +30,8 @@ TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 #: of their number. Median of the eight mirrors drawn at random in docs/calibrate.md (2.5 nm after 110 maps, 2.3 after
 #: 160, 1.6 after 312; of the worst of them 5.6, 4.6 and 2.5).
 TYPICAL_LAW = 4.6e-9
+#: The worst of them was so many times as far off; what is farther off has most likely not found the law yet.
+WORST_LAW = 2.2
 
 
 @dataclass(frozen=True)
@@ -91,9 +93,7 @@ def forecast(
     noise, influence = TYPICAL_NOISE, earlier.fit.influence_zernike if earlier else typical_influence(mirror)
     if earlier is not None:
         noise = math.sqrt(earlier.maps.noise_variance().mean()) or TYPICAL_NOISE
-    law = TYPICAL_LAW * np.sqrt(signals[0].size)
-    if earlier is not None and earlier.hysteresis is not None:
-        law = earlier.hysteresis.held_out_max_zernike * np.sqrt(earlier.hysteresis.maps)
+    law = left_of_one_map(earlier, mirror)
     parts = [*(end - 1 for end in sorted(plan.ends)), len(steps)]  # the degauss is no step here
     expected = Forecast(duration, 0.0)
     for part in parts:
@@ -112,15 +112,29 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     return np.array([map_time + step.settle_share * settle_time + step.dwell for step in steps])
 
 
-def expected_end(plan: Plan, done: int, reached: float, until: float) -> tuple[int, float]:
-    """The number of steps of `plan` after which `until` (m) is expected, or all, and what is expected then, m.
+def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
+    """What the law of `mirror` leaves of moves after one map, m, by its `earlier` calibration or mirrors like it.
 
     It falls as the root of the number of maps.
+    """
+    if earlier is not None and earlier.hysteresis is not None:
+        return float(earlier.hysteresis.held_out_max_zernike * np.sqrt(earlier.hysteresis.maps))
+    return float(TYPICAL_LAW * np.sqrt(mirror.actuators))
+
+
+def expected_end(plan: Plan, done: int, reached: float, until: float, law: float) -> tuple[int, float]:
+    """The number of steps of `plan` after which `until` (m) is expected, or all, and what is expected then, m.
+
+    It falls as the root of the number of maps once the law is found, and at once where it is found: before that
+    nothing is expected, 0.
 
     Args:
         done: steps so far.
         reached: m, with these.
+        law: m, see `left_of_one_map`.
     """
+    if reached > WORST_LAW * law / np.sqrt(done):
+        return len(plan.steps), 0.0
     ends = [*(end for end in sorted(plan.ends) if end > done + 1), len(plan.steps)]
     expected = [reached * np.sqrt(done / end) for end in ends]
     k = next((k for k, value in enumerate(expected) if value <= until), -1)
