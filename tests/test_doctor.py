@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,9 +27,11 @@ from dm_bringup.suite import load_config, save_config
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_tools.doctor import bench as doctor_bench
+from dm_tools.doctor import electronics
 from dm_tools.doctor import machine as doctor_machine
 from dm_tools.doctor.doctor import held_by_the_nodes
 from dm_tools.doctor.machine import Finding
@@ -255,11 +258,22 @@ def test_wrong_values_are_named_and_nothing_is_tried_with_them(wrong: str, tmp_p
 def test_a_port_in_use_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
-        assert doctor_bench.tcp("127.0.0.1", port) is None
+        driver = {"electronics.address": "127.0.0.1", "electronics.port": port, "mirror.actuators": 37}
+        assert electronics.opens("edac40_tcp", driver) is None
         finding = doctor_bench.taken_ports(GOOD["virtual_bench"] | {"trigger.port": port})
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
-    gone = doctor_bench.tcp("127.0.0.1", port)
+    gone = electronics.opens("edac40_tcp", driver)
     assert gone is not None and "Connection refused" in gone.problem
+
+
+def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
+    """Or what it takes to ask it."""
+    changes = {"electronics.kind": "microscope", "electronics.address": "PYRO:Mirror@127.0.0.1:9"}
+    config = {node: values for node, values in bench({"pdm_driver": changes}).items() if node != "virtual_bench"}
+    save_config(config, tmp_path / "bench.yaml")
+    found = {name: run() for name, run in doctor_bench.bench_checks(tmp_path / "bench.yaml")}
+    gone = found["electronics at PYRO:Mirror@127.0.0.1:9"]
+    assert gone is not None and "cannot open deformable mirror at PYRO:Mirror@127.0.0.1:9" in gone.problem
 
 
 def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
@@ -274,14 +288,14 @@ def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
 def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leader, follower = os.openpty()
     device = Path(os.ttyname(follower))
-    absent = doctor_bench.serial_port(tmp_path / "ttyUSB0")
+    absent = electronics.serial_port(tmp_path / "ttyUSB0")
     assert absent is not None and "does not exist" in absent.problem
-    busy = doctor_bench.serial_port(device)
+    busy = electronics.serial_port(device)
     assert busy is not None and busy.note and f"(process {os.getpid()}, " in busy.problem
     os.close(follower)
-    assert doctor_bench.serial_port(device) is None
+    assert electronics.serial_port(device) is None
     monkeypatch.setattr(os, "access", lambda *_arguments: False)  # tests may run as root, who may all
-    forbidden = doctor_bench.serial_port(device)
+    forbidden = electronics.serial_port(device)
     assert forbidden is not None and f"sudo usermod -aG {device.group()} $USER" in forbidden.cure
     os.close(leader)
 
@@ -328,15 +342,14 @@ def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
     serial = calibration.mirror_serial
     foreign = doctor_bench.stored_calibration(tmp_path, "other", MONTH_S)
     assert foreign is not None and f"those there are of {serial}" in foreign.problem
-    file = tmp_path / f"{calibration.id}.h5"
-    now = time.time()
-    os.utime(file, (now, now))
-    assert doctor_bench.stored_calibration(tmp_path, serial, MONTH_S) is None
-    long_ago = calibration.created_ns * 1e-9
-    os.utime(file, (long_ago, long_ago))
+    file, log = tmp_path / f"{calibration.id}.h5", tmp_path / f"{calibration.id}.checks.csv"
+    check = Check(time.time(), 1, 1e-9, 1e-9, 1.0, 0.0, 1, 0.0)
+    append_check(log, replace(check, accepted=0))
     assert doctor_bench.stored_calibration(tmp_path, serial, 1e10) is None
     old = doctor_bench.stored_calibration(tmp_path, serial, MONTH_S)
-    assert old is not None and old.note and "days old" in old.problem and "./dm check" in old.cure
+    assert old is not None and old.note and f"{calibration.id} for" in old.problem and "./dm check" in old.cure
+    append_check(log, check)
+    assert doctor_bench.stored_calibration(tmp_path, serial, MONTH_S) is None
     file.write_bytes(b"nothing of that kind")
     damaged = doctor_bench.stored_calibration(tmp_path, serial, MONTH_S)
     assert damaged is not None and not damaged.note and calibration.id in damaged.problem

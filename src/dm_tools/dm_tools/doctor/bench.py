@@ -1,4 +1,4 @@
-"""What the doctor checks on one bench: its file, the electronics, ports, folders, the calibration in store."""
+"""What the doctor checks on one bench: its file, ports, folders, the calibration in store."""
 
 import os
 import shutil
@@ -12,8 +12,9 @@ from typing import Any
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.suite import Config, ConfigError, load_config
 from dm_common.errors import unknown_name
-from dm_common.ros.domains import held_by, holders
+from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
+from dm_tools.doctor.electronics import electronics_checks
 from dm_tools.doctor.machine import Check, Finding, disk
 
 UNSET = "CHANGE"
@@ -44,7 +45,7 @@ def bench_checks(file: Path) -> Iterator[Check]:
     if "virtual_bench" in config:
         yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
     else:
-        yield from _electronics(driver)
+        yield from electronics_checks(effective("pdm_driver", driver))
     watched = _folder_of(sound, "interferometer", "watch_folder")
     if watched is not None:
         writes = "{path}" in " ".join(sound["interferometer"].get("trigger_command", []))
@@ -136,71 +137,6 @@ def aperture_fits(config: Config) -> Finding | None:
     return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver") if problem else None
 
 
-def _electronics(driver: Mapping[str, Any]) -> Iterator[Check]:
-    kind, address = driver.get("electronics.kind"), driver.get("electronics.address", "")
-    port = driver.get("electronics.port", 1234)
-    if kind == "edac40_tcp" and address:
-        yield f"electronics at {address}:{port}", lambda: tcp(address, port)
-    discovery = driver.get("electronics.discovery_port", 0)
-    if kind == "edac40_udp" and address and discovery:
-        yield f"electronics at {address}", lambda: answers_discovery(address, discovery)
-    device = driver.get("electronics.serial_port", "")
-    if kind in ("usb_dac40", "framed_serial") and device:
-        yield f"serial port {device}", lambda: serial_port(Path(device).expanduser())
-
-
-def tcp(address: str, port: int) -> Finding | None:
-    try:
-        socket.create_connection((address, port), 2.0).close()
-    except OSError as error:
-        return Finding(
-            f"no EDAC40 answers at {address}:{port}: {error}",
-            "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one client "
-            "at a time: close the vendor's program, or stop the nodes that hold it",
-        )
-    return None
-
-
-def answers_discovery(address: str, port: int) -> Finding | None:
-    from dm_driver.electronics.discovery import discover
-
-    try:
-        if discover(address, port, 1.0):
-            return None
-        reason = "no answer within 1 s"
-    except OSError as error:
-        reason = str(error)
-    return Finding(f"no EDAC40 at {address}: discovery on UDP port {port}: {reason}", "check power, cable and address")
-
-
-def serial_port(device: Path) -> Finding | None:
-    if not device.exists():
-        return Finding(
-            f"{device} does not exist",
-            "plug the unit in; `ls -l /dev/serial/by-id` shows what is there, under names that stay",
-        )
-    if not os.access(device, os.R_OK | os.W_OK):
-        group = _group(device)
-        return Finding(
-            f"no permission for {device}: it belongs to the group {group}",
-            f"sudo usermod -aG {group} $USER, then log out and in again",
-        )
-    if users := holders([device.resolve()]):
-        return Finding(
-            f"{device} is in use by {', '.join(users)}",
-            "end that program: two writers on one unit tear each other's frames",
-            note=True,
-        )
-    return None
-
-
-def _group(path: Path) -> str:
-    try:
-        return path.group()
-    except KeyError:
-        return str(path.stat().st_gid)
-
-
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
     """Ports that the bench wants and that others hold; None = all are free."""
     values, taken = effective("virtual_bench", bench), []
@@ -262,7 +198,8 @@ def writable_folder(folder: Path) -> Finding | None:
 
 
 def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding | None:
-    """Whether there is a readable calibration of this mirror, compared with a map in the last `stale_after`, s."""
+    """Whether there is a readable calibration of this mirror, made or agreed with in the last `stale_after`, s."""
+    from dm_calibration.recalibration.check_log import SUFFIX, read_checks
     from dm_calibration.store.calibration_store import CalibrationStore
 
     entries = CalibrationStore(folder).entries()
@@ -278,11 +215,12 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
         )
     newest = own[0]
     assert newest is not None
-    checked = max(newest.created_ns * 1e-9, (folder / f"{newest.id}.h5").stat().st_mtime)  # updates rewrite the file
+    agreed = [check.time for check in read_checks(folder / f"{newest.id}{SUFFIX}") if check.accepted]
+    checked = max([newest.created_ns * 1e-9, *agreed])
     days = (time.time() - checked) / DAY_S
     if days * DAY_S > stale_after:
         return Finding(
-            f"{newest.id} is {days:.0f} days old, and no map has been compared with it since",
+            f"no map has agreed with {newest.id} for {days:.0f} days",
             "./dm check says whether it is still true, and mends small drifts; else ./dm calibrate",
             note=True,
         )

@@ -1,0 +1,85 @@
+"""What the doctor checks of drive electronics: whether they are there; no output changes."""
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dm_common.ros.domains import holders
+from dm_tools.doctor.machine import Check, Finding
+
+#: What helps where the link to electronics does not open that can be tried, by their kind.
+CURES = {
+    "edac40_tcp": "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one "
+    "client at a time: close the vendor's program, or stop the nodes that hold it",
+    "microscope": "start the device server of python-microscope; electronics.address is what it says then",
+}
+
+
+def electronics_checks(driver: Mapping[str, Any]) -> Iterator[Check]:
+    """Those that the parameters of the driver call for, all of them given."""
+    kind, address = driver["electronics.kind"], driver["electronics.address"]
+    if kind in CURES and address:
+        yield f"electronics at {address}", lambda: opens(kind, driver)
+    discovery = driver["electronics.discovery_port"]
+    if kind == "edac40_udp" and address and discovery:
+        yield f"electronics at {address}", lambda: answers_discovery(address, discovery)
+    device = driver["electronics.serial_port"]
+    if kind in ("usb_dac40", "framed_serial") and device:
+        yield f"serial port {device}", lambda: serial_port(Path(device).expanduser())
+
+
+def opens(kind: str, driver: Mapping[str, Any]) -> Finding | None:
+    """Whether the link opens, by the class of the driver's with which it does; no output changes."""
+    from dm_driver.electronics import ElectronicsSettings, make_electronics
+    from dm_driver.electronics.base import LinkError
+
+    address, port, channels = (driver[name] for name in ("electronics.address", "electronics.port", "mirror.actuators"))
+    settings = ElectronicsSettings(address, port, channels=channels)
+    electronics = make_electronics(kind, settings)
+    try:
+        electronics.open()
+        electronics.close()
+    except LinkError as error:
+        return Finding(str(error), CURES[kind])
+    return None
+
+
+def answers_discovery(address: str, port: int) -> Finding | None:
+    from dm_driver.electronics.discovery import discover
+
+    try:
+        if discover(address, port, 1.0):
+            return None
+        reason = "no answer within 1 s"
+    except OSError as error:
+        reason = str(error)
+    return Finding(f"no EDAC40 at {address}: discovery on UDP port {port}: {reason}", "check power, cable and address")
+
+
+def serial_port(device: Path) -> Finding | None:
+    if not device.exists():
+        return Finding(
+            f"{device} does not exist",
+            "plug the unit in; `ls -l /dev/serial/by-id` shows what is there, under names that stay",
+        )
+    if not os.access(device, os.R_OK | os.W_OK):
+        group = _group(device)
+        return Finding(
+            f"no permission for {device}: it belongs to the group {group}",
+            f"sudo usermod -aG {group} $USER, then log out and in again",
+        )
+    if users := holders([device.resolve()]):
+        return Finding(
+            f"{device} is in use by {', '.join(users)}",
+            "end that program: two writers on one unit tear each other's frames",
+            note=True,
+        )
+    return None
+
+
+def _group(path: Path) -> str:
+    try:
+        return path.group()
+    except KeyError:
+        return str(path.stat().st_gid)
