@@ -21,6 +21,8 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.recalibration.check_log import Check, append_check
+from dm_calibration.recalibration.update_storage import write_updates
+from dm_calibration.recalibration.updates import SUFFIX, RecalibrationManager, UpdateOptions
 from dm_calibration.report import content, content_hysteresis
 from dm_calibration.report.certificate import certificate, curvatures, keep_people, people
 from dm_calibration.report.checks import next_calibration
@@ -28,7 +30,7 @@ from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
 from dm_calibration.report.html_page import one_html
-from dm_calibration.report.page import figures_of, write_report
+from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -156,6 +158,24 @@ def test_message_and_certificate_agree(
     message = calibration_message(judged, None, "mirror", error_max)
     assert (message.quality == message.CALIBRATED) is good
     assert ("<td>calibrated</td>" in one_html("", [certificate(judged, {}, (), error_max)])) is good
+
+
+def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibration, tmp_path: Path) -> None:
+    """It promised the range and the accuracy of all actuators after one of them was given up."""
+    file = CalibrationStore(tmp_path).save(calibration)
+    updates = RecalibrationManager(tmp_path, UpdateOptions)
+    updates.begin(calibration)
+    assert updates.in_use is not None
+    drift = updates.in_use.drift
+    drift = replace(drift, stuck=np.where(np.arange(37) == 4, -1.0, drift.stuck), surprising=3)
+    write_updates(tmp_path / f"{calibration.id}{SUFFIX}", calibration.id, updates.in_use.basis, drift)
+    first = one_html("", sections(calibration, file)[:1])
+    for expected in (
+        "approximate:",
+        "calibrate again; Goes on without actuator 5 (stands at -1.00)</td>",
+        "./dm status",
+    ):
+        assert expected in first
 
 
 def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[Check]:

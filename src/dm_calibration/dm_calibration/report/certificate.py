@@ -86,6 +86,7 @@ def certificate(
     names: Mapping[str, str],
     checks: Sequence[Check] = (),
     error_max: float = CALIBRATED_ERROR_MAX,
+    since: Sequence[str] = (),
 ) -> Section:
     """Verdict, range, promise, term and names.
 
@@ -93,8 +94,10 @@ def certificate(
         names: of `operator` and `instrument`.
         checks: since then, oldest first.
         error_max: m that a calibrated mirror promises.
+        since: what checks have shown that it holds no more, or in part only: sentences.
     """
-    reasons, bound = calibration.doubts(error_max), length(calibration.promise, calibration.wavelength)
+    reasons = [*calibration.doubts(error_max), *(sentence.rstrip(".") for sentence in since)]
+    bound = length(calibration.promise, calibration.wavelength)
     low, high = curvatures(calibration)
     until, _reason = next_calibration(checks, calibration.promise, calibration.created_ns * 1e-9)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
@@ -118,6 +121,8 @@ def certificate(
         f"moves to a sphere in the range below are promised to end within {bound} of it in every Zernike coefficient "
         "beyond tilt."
     )
+    if since:
+        sentence += " That is as it was measured; ./dm status says what holds since then."
     picture = Picture(
         "responses",
         "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",

@@ -9,6 +9,7 @@ import numpy as np
 from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.report import certificate, checks, content, content_fit, content_hysteresis
 from dm_calibration.report.content_hysteresis import loop_opening
 from dm_calibration.report.document import Section
@@ -33,11 +34,15 @@ def sections(
     Raises:
         OSError: `file` cannot be read.
     """
-    left = residuals(calibration)
+    left, since = residuals(calibration), list[str]()
+    if file is not None:
+        updates = RecalibrationManager(file.parent, UpdateOptions)
+        updates.begin(calibration)
+        since = updates.doubts
     log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
-        certificate.certificate(calibration, certificate.people(), log, error_max),
+        certificate.certificate(calibration, certificate.people(), log, error_max, since),
         certificate.every_actuator(calibration),
         Section("Appendix", ["What the two pages before rest on."]),
         *([checks.checks_section(calibration, log)] if log else []),
