@@ -6,9 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.zernike import DEFOCUS
+from dm_tools import cli
 from dm_tools.verbs import measure
 
 
@@ -25,3 +27,9 @@ def test_the_bound_of_the_scale_is_that_of_the_instrument(
     assert values["pitch"] == pytest.approx(pitch, rel=1e-6)
     expected = 0.5 * instrument_error / coefficients[DEFOCUS]  # the scale goes with the root of the defocus
     assert values.get("scale_error", 0.0) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("radius", ["0", "nan", "inf"])
+def test_what_is_no_radius_is_refused_before_a_map_is_taken(radius: str) -> None:
+    done = CliRunner().invoke(cli.app, ["measure", "--reference-sphere", radius])
+    assert done.exit_code == 2 and f"--reference-sphere {radius}: must be a radius in m" in done.output

@@ -20,6 +20,8 @@ from dm_common.optics.zernike import MAX_ORDER, PISTON_TILT, TERMS
 RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)
 #: Tilts that retrace error is found from must differ by this much in each direction, m at the edge.
 TILT_MIN = 1e-7
+#: Coefficients of maps of one shape differ by no more than this once their retrace error is taken off, m.
+LEFT_MAX = 3e-8
 #: Fewest maps, and fewest points of a grid, that leave something to judge the result by.
 MAPS_MIN, POINTS_MIN = 5, 8
 
@@ -58,7 +60,7 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
         most, m: as they are, and without the retrace error.
 
     Raises:
-        ValueError: too few maps, maps of different sizes, or tilts that do not differ in both directions.
+        ValueError: too few maps, maps of different sizes or shapes, or tilts that do not differ in both directions.
     """
     if len(maps) < MAPS_MIN or len({sag.shape for sag in maps}) > 1:
         sizes = sorted({"{1} x {0}".format(*sag.shape) for sag in maps})
@@ -76,8 +78,13 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
         )
     design = np.column_stack((np.ones(len(maps)), tilt))
     solution = np.linalg.lstsq(design, terms, rcond=None)[0]
-    before = np.abs(terms - terms.mean(axis=0)).max()
-    return solution[1:].ravel(), float(before), float(np.abs(terms - design @ solution).max())
+    before, left = (float(np.abs(terms - mean).max()) for mean in (terms.mean(axis=0), design @ solution))
+    if left > LEFT_MAX:
+        raise ValueError(
+            f"coefficients differ by up to {left * 1e9:.0f} nm that do not go with the tilt: must be "
+            f"{LEFT_MAX * 1e9:.0f} nm or less; take maps of one shape, by smaller tilts, or average them"
+        )
+    return solution[1:].ravel(), before, left
 
 
 def undistorted(sag: Floats, distortion: float) -> Floats:

@@ -1,5 +1,6 @@
 """`dm measure`: take one map of the mirror as it stands."""
 
+import math
 from typing import Annotated, Any
 
 import typer
@@ -24,6 +25,8 @@ def measure(
     """Take one map of the mirror as it stands, and say what it shows. Nothing moves."""
     from dm_common.optics.zernike import PISTON_TILT, SPOKEN, curvature_of, rms_beyond_tilt
 
+    if reference_sphere is not None and not 0.0 < abs(reference_sphere) < math.inf:
+        raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
         answer = client.measure(label)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
