@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from dm_msgs.msg import FocusRequest
 
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
-from dm_controller.focus_types import CommandedShape, SendCommand, Sent
+from dm_controller.focus_types import Moment, Order, SendCommand
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
@@ -41,12 +43,14 @@ class Shape:
         move = self.planner.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
         self.estimate = ActuatorEstimate(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
         self.signals, self.effective = move.plan.signals, move.effective
-        sent = Sent(SendCommand(self.signals, 0), None, 0.0, 0.0, confirmed=True)
-        self.commanded = self.hold.shape = CommandedShape(move, self.planner, sent, held=True, checked=0.0)
+        active: Any = SimpleNamespace(planner=self.planner)
+        self.order = Order(FocusRequest(), Moment(0, 0.0, 0.0), active, move, creep_held=True)
+        self.hold.order = self.order
+        self.send(self.signals, 0.0, confirmed=True)
 
     def send(self, signals: np.ndarray, now: float, confirmed: bool) -> None:
         """A correction goes out."""
-        self.commanded.sent = Sent(SendCommand(signals, 0), None, now, now, confirmed)
+        self.order.command = SendCommand(signals, Moment(0, now, now), confirmed=confirmed)
 
     def correct(self, now: float) -> np.ndarray | None:
         """The correction due at `now`, carried out at once."""

@@ -159,21 +159,21 @@ class Fields:
     """
 
     def __init__(self, table: Mapping[str, Value]) -> None:
-        # Each with what is right without another look: a choice, an empty array, or a number within a range.
+        # Each with what is right without another look: a choice, an empty array or text, a number within a range.
         self._rules = [
-            (name, attrgetter(name), value, value.many, 0 in value.sizes, *_quick(value))
+            (name, attrgetter(name), value, value.many or value.kind is str, 0 in value.sizes, *_quick(value))
             for name, value in table.items()
         ]
 
     def check(self, message: Any) -> None:
         """Raise Refusal naming the first field that may not be as it is, its value and what is allowed."""
-        for name, get, value, many, may_be_empty, low, high in self._rules:
+        for name, get, value, counted, may_be_empty, low, high in self._rules:
             given = get(message)
             # Most are right, and a request on its way to the mirror waits for this.
-            if many:
-                right = may_be_empty and not len(given)
-            elif value.choices:
+            if value.choices:
                 right = given in value.choices
+            elif counted:
+                right = may_be_empty and not len(given)
             else:
                 right = low <= high and low <= given <= high
             if not right:

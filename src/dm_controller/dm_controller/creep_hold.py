@@ -19,7 +19,7 @@ from dm_msgs.msg import ActuatorState
 from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import same_signals
-from dm_controller.focus_types import CommandedShape, Moment, SendCommand
+from dm_controller.focus_types import Moment, Order, SendCommand
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
@@ -37,42 +37,42 @@ class CreepHold:
         values: parameters `hold.*`, live.
 
     Attributes:
-        shape: that was commanded last; None = none was yet.
+        order: whose shape was commanded last; None = none was yet.
         corrections: sent so far.
         ended: the reason why the last hold ended.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
-        self.shape: CommandedShape | None = None
+        self.order: Order | None = None
         self.corrections = 0
         self.ended = ""
 
     @property
     def active(self) -> bool:
         """Whether a shape is held."""
-        return self.shape is not None and self.shape.held
+        return self.order is not None and self.order.creep_held
 
     @property
     def next_check(self) -> float:
         """When a correction can be due, s; infinite without a shape to hold."""
-        shape = self.shape
-        if shape is None or not shape.held:
+        order = self.order
+        if order is None or order.command is None or not order.creep_held:
             return math.inf
-        sent = shape.sent.time
-        return max(sent + self._values["hold.period"], shape.checked + CHECK_SHARE * (shape.checked - sent))
+        sent = order.command.sent.time
+        return max(sent + self._values["hold.period"], order.checked + CHECK_SHARE * (order.checked - sent))
 
     def end(self, reason: str) -> None:
         """Leave the shape as it stands."""
-        if self.shape is not None and self.shape.held:
-            self.shape.held, self.ended = False, reason
+        if self.order is not None and self.order.creep_held:
+            self.order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
         """What the driver reports as its last request (N,): the hold ends when it is another's."""
-        shape = self.shape
-        if shape is None or same_signals(requested, shape.sent.command.signals):
+        command = self.order.command if self.order is not None else None
+        if command is None or same_signals(requested, command.signals):
             return
-        if shape.sent.confirmed or now - shape.sent.time > CONFIRM_S:
+        if command.confirmed or now - command.sent.time > CONFIRM_S:
             self.end("another command came")
 
     def command(
@@ -82,35 +82,40 @@ class CreepHold:
 
         `estimate` gives the actuators at a time, s.
         """
-        shape = self.shape
-        if shape is None or not shape.held or report is None or report.moving:
+        order = self.order
+        if order is None or not order.creep_held or report is None or report.moving:
             return None
-        if report.holder not in ("", shape.sent.command.holder):
+        if report.holder not in ("", order.request.holder):
             return None  # goes on afterwards, if they leave the shape as it is
         signals = self.correction(estimate(now.time), now.time)
-        return None if signals is None else shape.send_on(signals, now, report.turns)
+        return None if signals is None else order.send_on(signals, now, report.turns)
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""
-        shape, values = self.shape, self._values
-        if shape is None or not shape.held or estimate.state is None or not shape.sent.confirmed:
+        order, values = self.order, self._values
+        if order is None or not order.creep_held or estimate.state is None:
             return None
-        planner, effective, sent = shape.planner, shape.move.effective, shape.sent
-        if shape.move.known and not estimate.known:
+        assert order.active is not None and order.move is not None and order.command is not None
+        planner, move, command = order.active.planner, order.move, order.command
+        if not command.confirmed:
+            return None
+        if move.known and not estimate.known:
             self.end(f"the history of the actuators was lost: {estimate.unknown}")
             return None
         if not values["hold.enable"]:
             self.end("hold.enable is false")
             return None
-        sent.time, shape.checked = min(sent.time, now), min(shape.checked, now)  # the clock was set back
+        # The clock was set back.
+        command.sent = command.sent._replace(time=min(command.sent.time, now))
+        order.checked = min(order.checked, now)
         if now < self.next_check:
             return None
-        shape.checked = now
-        if planner.drift(estimate.state, now, effective) <= values["hold.tolerance"]:
+        order.checked = now
+        if planner.drift(estimate.state, now, move.effective) <= values["hold.tolerance"]:
             return None
         # The interval to come is about as long as the one that ends; the shape is to be right in its middle.
-        ahead = 0.5 * (now - sent.time)
-        change = planner.hold(estimate.state, now, effective, ahead) - estimate.state.signals
+        ahead = 0.5 * (now - command.sent.time)
+        change = planner.hold(estimate.state, now, move.effective, ahead) - estimate.state.signals
         largest = float(np.abs(change).max())
         if largest < 0.5 * values["hold.resolution"]:
             return None

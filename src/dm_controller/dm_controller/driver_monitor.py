@@ -8,7 +8,6 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
-from dm_controller.focus_types import CommandedShape, Log, Moment, Order, Progress, PublishState
+from dm_controller.focus_types import Log, Moment, Order, Progress, PublishState
 
 #: States from which a driver does not come back by itself, as it does from a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
@@ -56,7 +55,7 @@ class DriverMonitor:
         values: parameters `driver_timeout` and `move_timeout`.
 
     Attributes:
-        shape: that was commanded last; None = none was yet.
+        order: whose shape was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
         starts: how often the driver was activated anew, as far as reports tell.
         open_until: s, until when the driver counts as one that takes commands of anybody; after it ask `check`.
@@ -65,7 +64,7 @@ class DriverMonitor:
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
-        self.shape: CommandedShape | None = None
+        self.order: Order | None = None
         self.latest: ActuatorState | None = None
         self.starts = 0
         self.open_until = -math.inf
@@ -93,15 +92,15 @@ class DriverMonitor:
         anew = before is not None and report.sequence < before.sequence
         self.starts += anew
         self._trust()
-        if self.shape is None or self.shape.sent.confirmed:
+        command = self.order.command if self.order is not None else None
+        if command is None or command.confirmed:
             return False
-        sent = self.shape.sent
-        sent.confirmed = same_signals(report.requested, sent.command.signals)
+        command.confirmed = same_signals(report.requested, command.signals)
         written = stamp_ns(report.header.stamp)
-        seconds = 1e-9 * (written - sent.command.stamp_ns)
+        seconds = 1e-9 * (written - command.sent.ns)
         # A driver that was active before the command was sent may have it on the way.
-        sent.lost |= anew and (report.driver_state != ActuatorState.STATE_ACTIVE or written > sent.command.stamp_ns)
-        if not sent.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
+        command.lost |= anew and (report.driver_state != ActuatorState.STATE_ACTIVE or written > command.sent.ns)
+        if not command.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
         return len(self._latencies) == 1
@@ -165,14 +164,13 @@ class DriverMonitor:
             raise Refusal(ErrorCode.BUSY, report.holding)
 
     def settled(self, replaced: str = "") -> list[PublishState]:
-        """What came of the order of the last command, once: the driver has confirmed it, or it is `replaced` before."""
-        sent = self.shape.sent if self.shape is not None else None
-        if sent is None or sent.order is None or sent.given_up or not (sent.confirmed or replaced):
+        """What came of the last order's command, once: the driver has confirmed it, or it is `replaced` before."""
+        order = self.order
+        if order is None or order.command is None or order.answered or not (order.command.confirmed or replaced):
             return []
-        order, sent.order = sent.order, None
-        refusal = None if sent.confirmed else Refusal(ErrorCode.PREEMPTED, replaced)
-        order.outcome = replace(order.outcome, applied=sent.confirmed, refusal=refusal)
-        return [PublishState(order.outcome)]
+        order.answered, order.applied = True, order.command.confirmed
+        order.refusal = None if order.applied else Refusal(ErrorCode.PREEMPTED, replaced)
+        return [PublishState(order)]
 
     def stopped(self, now: float) -> str:
         """The reason why what was begun with the driver will not end any more; "" = it may: a lost link comes back."""
@@ -183,22 +181,24 @@ class DriverMonitor:
 
     def keeps(self, order: Order) -> bool:
         """Whether the last command is to keep the shape of `order`, be it corrected for creep."""
-        move, shape = order.outcome.move, self.shape
-        if move is None or shape is None or not shape.kept:
+        last = self.order
+        if order.move is None or last is None or last.move is None or not last.kept:
             return False
-        return same_signals(move.signals, shape.move.signals)
+        return same_signals(order.move.signals, last.move.signals)
 
     def progress(self, order: Order, now: float) -> Progress:
         """How far the driver is with `order`."""
-        if order.outcome.refusal is not None:
-            return Progress(failed=order.outcome.refusal)
-        assert order.outcome.move is not None
+        if order.refusal is not None:
+            return Progress(failed=order.refusal)
+        assert order.move is not None
+        waited = now - order.began.steady
         if order.pending:
-            expected = order.outcome.move.duration
-            return Progress(True, min(1.0, (now - order.began) / expected) if expected > 0.0 else 0.0)
-        if self.shape is None or not self.keeps(order):
+            expected = order.move.duration
+            return Progress(True, min(1.0, waited / expected) if expected > 0.0 else 0.0)
+        if not self.keeps(order):
             return SUPERSEDED
-        signals = order.outcome.move.signals
+        assert self.order is not None and self.order.command is not None  # else nothing keeps a shape
+        signals, last = order.move.signals, self.order.command.signals
         report = self.latest
         if report is not None and report.driver_state != ActuatorState.STATE_ACTIVE:
             return Progress(failed=_not_active(report))
@@ -209,37 +209,38 @@ class DriverMonitor:
             gap = float(np.abs(np.asarray(report.applied) - signals).max())
             order.gap = max(order.gap, gap)
             share = 1.0 - gap / order.gap if order.gap else 1.0
-            ours = any(same_signals(report.requested, own) for own in (signals, self.shape.sent.command.signals))
+            ours = any(same_signals(report.requested, own) for own in (signals, last))
             if ours and not report.moving:
                 return Progress(share=1.0, remaining=gap, stands=True)
             if order.taken and not ours:
                 return SUPERSEDED
             order.taken = ours
-        if now - order.began > self._values["move_timeout"]:
+        if waited > self._values["move_timeout"]:
             text = report.message if report is not None else ""
             return Progress(failed=Refusal(ErrorCode.TIMEOUT, text or "the driver did not report the shape"))
         return Progress(share=share, remaining=gap)
 
-    def untaken(self, now: float) -> tuple[Order | None, Refusal] | None:
-        """The order whose command the driver has not confirmed in time, and the reason; each is given once.
+    def untaken(self, now: float) -> Refusal | None:
+        """The reason why the driver has not confirmed the last command in time, once; None = there is none.
 
-        None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
+        A command that went out later is the one that counts: the latest wins at the driver too.
         """
-        if self.shape is None:
+        command = self.order.command if self.order is not None else None
+        if command is None or command.confirmed or command.given_up:
             return None
-        limit, sent = self._values["driver_timeout"] or CONFIRM_S, self.shape.sent
-        if sent.confirmed or sent.given_up or not (sent.lost or self.gone or now - sent.steady > limit):
+        limit = self._values["driver_timeout"] or CONFIRM_S
+        if not (command.lost or self.gone or now - command.sent.steady > limit):
             return None
-        sent.given_up = True
+        command.given_up = True
         text = "the driver has not confirmed the command"
-        if sent.lost:
-            return sent.order, Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"{text}: pdm_driver was restarted meanwhile")
+        if command.lost:
+            return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"{text}: pdm_driver was restarted meanwhile")
         if (refusal := self.refusal(now)) is not None:
-            return sent.order, Refusal(refusal.error_code, f"{text}: {refusal}")
+            return Refusal(refusal.error_code, f"{text}: {refusal}")
         report = self.latest
         assert report is not None  # else there had been a refusal
         if report.error_code != ErrorCode.OK:
-            return sent.order, Refusal(report.error_code, f"{text}: {report.message}")
-        if self._heard < sent.steady:
-            return sent.order, Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
-        return sent.order, Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")
+            return Refusal(report.error_code, f"{text}: {report.message}")
+        if self._heard < command.sent.steady:
+            return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
+        return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from copy import copy
 from typing import Any
 
 from dm_msgs.action import Degauss, MoveFocus
@@ -15,13 +18,14 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import ManagedNode
+from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_common.values import without_figures
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_parameters import MOVE_FOCUS
-from dm_controller.focus_types import Moment, Order, Outcome, StartDegauss
+from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
 
 #: How often an order is looked after, s: by an action, by a service, and how often feedback is published.
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
@@ -29,24 +33,61 @@ POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
 GRACE_S = 1.0
 
 
-class FocusHost(ManagedNode):
-    """The node, as services and actions ask it from their threads."""
+class FocusHost(ManagedNode, ABC):
+    """The node as services, actions and its lifecycle see it: one thread at a time has the controller.
 
+    Args:
+        name, table, on_change, keywords: see `ManagedNode`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        table: Sequence[Parameter],
+        on_change: Callable[[Mapping[str, Any]], None],
+        **keywords: Any,
+    ) -> None:
+        super().__init__(name, table, on_change, **keywords)
+        self._lock, self._controller = threading.Lock(), FocusController(self._values)
+
+    @abstractmethod
     def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
         """The controller, for one thread at a time, and what time it is."""
-        raise NotImplementedError
 
+    @abstractmethod
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
         """Judge a request and, unless it is refused or a dry run, carry it out."""
-        raise NotImplementedError
 
-    def state(self, outcome: Outcome) -> FocusState:
-        """What came of a request."""
-        raise NotImplementedError
+    @abstractmethod
+    def carry_out(self, effects: Iterable[Effect], now: Moment) -> None:
+        """Do what the controller says."""
+
+    @abstractmethod
+    def state(self, order: Order) -> FocusState:
+        """What came of an order that does not change meanwhile."""
+
+    def deactivate(self) -> None:
+        with self.controller() as (controller, now):
+            self.carry_out(controller.rest(Refusal(ErrorCode.NODE_INACTIVE, self.inactive()), now), now)
+
+    def clean_up(self) -> None:
+        self.deactivate()  # with another sentence
+
+    def refused(self, reason: str) -> None:
+        self.deactivate()
 
     def stop(self, order: Order) -> bool:
         """Leave the move of an order where it is; False = another shape was asked for since."""
-        raise NotImplementedError
+        with self.controller() as (controller, now):
+            effects = controller.stop(order, now)
+            self.carry_out(effects or (), now)
+        return effects is not None
+
+    def answer(self, order: Order) -> FocusState:
+        """What has come of an order so far."""
+        with self._lock:
+            so_far = copy(order)
+        return self.state(so_far)
 
 
 class FocusServices:
@@ -72,11 +113,11 @@ class FocusServices:
     def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
         order = self._node.order(request, dry_run)
         deadline = time.monotonic() + GRACE_S + (self._driver_timeout() or CONFIRM_S)
-        while waits := not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
+        while waits := not (dry_run or order.pending or order.applied or order.refusal):
             if time.monotonic() > deadline:
                 break
             time.sleep(SERVICE_POLL_S)
-        response.state = state = self._node.state(order.outcome)
+        response.state = state = self._node.answer(order)
         response.error_code, response.message = state.error_code, state.message
         if waits:
             response.error_code = ErrorCode.TIMEOUT
@@ -112,7 +153,7 @@ class MoveFocusAction:
             return self._stopped(handle, None)
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
         if goal.tolerance > 0.0:
-            preview = node.state(node.order(goal.request, dry_run=True).outcome)
+            preview = node.state(node.order(goal.request, dry_run=True))
             if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
                 result.state = preview
                 return (
@@ -123,7 +164,7 @@ class MoveFocusAction:
                 )
         order = node.order(goal.request)
         ended = self._follow(handle, order)
-        result.state = node.state(order.outcome)
+        result.state = node.answer(order)
         if ended is not None:
             return ended
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))

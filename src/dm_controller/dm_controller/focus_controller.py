@@ -19,16 +19,14 @@ from dm_controller.conditioning import Conditioning
 from dm_controller.creep_hold import CreepHold
 from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import (
-    CommandedShape,
     Effect,
     Log,
     Moment,
     Order,
-    Outcome,
     PublishCapabilities,
+    PublishEstimate,
     PublishState,
     SendCommand,
-    Sent,
     StartDegauss,
 )
 from dm_controller.planning.active_calibration import NO_CALIBRATION, NO_TILT, ActiveCalibration, active_calibration
@@ -38,6 +36,8 @@ from dm_controller.planning.target import REQUEST, FocusTarget
 
 #: How often a held shape is checked while no correction can be due sooner, s.
 SLOW_PERIOD_S = 1.0
+#: How often the estimate of the actuators is published while the mirror moves, s of wall time.
+ESTIMATE_PERIOD_S = 0.25
 
 
 class FocusController:
@@ -63,7 +63,10 @@ class FocusController:
         self.not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
         self.observer, self.monitor, self.hold = HysteresisObserver(), DriverMonitor(values), CreepHold(values)
         self.conditioning = Conditioning()
-        self._reported: tuple[object, ...] = ()  # what the last capabilities said of the driver
+        # What the last capabilities said of the driver, and the last estimate; and when the next is due, s, steady.
+        self._reported: tuple[object, ...] = ()
+        self._estimated: tuple[object, ...] = ()
+        self._estimate_due = 0.0
         self._at_rest: ActuatorEstimate | None = None  # what a mirror at rest holds until its next report
         self.requests = self.refused = 0
         self.degauss_offered: Callable[[], bool] = lambda: False
@@ -121,12 +124,18 @@ class FocusController:
         return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
 
     def _news(self, now: Moment, more: bool = False) -> list[Effect]:
-        """Publish the capabilities when the driver or what is known of the actuators changed, or there is `more`."""
-        known = refusal.error_code if (refusal := self.unavailable(now)) else ErrorCode.OK, self.observer.unknown
-        if not more and self._reported == known:
-            return []
-        self._reported = known
-        return [PublishCapabilities()]
+        """Publish what changed: of the driver, or there is `more`; of the actuators, of a mirror that moves seldom."""
+        refusal, observer, effects = self.unavailable(now), self.observer, list[Effect]()
+        known = refusal.error_code if refusal else ErrorCode.OK, observer.unknown
+        if more or self._reported != known:
+            self._reported = known
+            effects.append(PublishCapabilities())
+        estimated = observer.state, observer.unknown, self.active
+        due = not (observer.latest and observer.latest.moving) or now.steady >= self._estimate_due
+        if estimated != self._estimated and due:
+            self._estimated, self._estimate_due = estimated, now.steady + ESTIMATE_PERIOD_S
+            effects.append(PublishEstimate())
+        return effects
 
     # --- requests ---
 
@@ -136,7 +145,8 @@ class FocusController:
         The newest request wins.
         """
         self.requests += 1
-        return self._attempt(Order(request, Outcome(request, now.ns), began=now.steady), now, dry_run)
+        order = Order(request, now)
+        return order, self._attempt(order, now, dry_run)
 
     def judge(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:
         """The move that a request asks for, from the mirror as it is.
@@ -167,62 +177,49 @@ class FocusController:
         context = PlanningContext(active, estimate, now.time, settle, degauss)
         return choose_move(target, request.mode, budget, context)
 
-    def _attempt(
-        self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None
-    ) -> tuple[Order, list[Effect]]:
+    def _attempt(self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None) -> list[Effect]:
         effects: list[Effect] = []
-        move = refusal = None
-        held = self.active is not None and self._values["hold.enable"] and self.active.planner.law.creep_rate > 0.0
+        active = self.active
+        order.began, order.active, order.move = now, active, None
+        order.unknown = (self._at_rest or self.observer).unknown
+        order.creep_held = active is not None and self._values["hold.enable"] and active.planner.law.creep_rate > 0.0
         try:
-            move = self.judge(order.request, now, degaussed)
-            assert self.active is not None
+            move = order.move = self.judge(order.request, now, degaussed)
             tolerance = self._values["reachable_tolerance"]
             if not move.max_zernike <= tolerance:
-                raise unreachable(move, self.active, tolerance)
+                assert active is not None  # else it is refused
+                raise unreachable(move, active, tolerance)
             if not dry_run:
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)
                 if degaussed is not None or (move.degauss is None and self.conditioning.run is None):
-                    effects += self._go(order, move, now, held)
+                    effects += self._go(order, move, now)
                 else:
                     effects += self._condition(order, move, now)
-        except Refusal as error:
-            refusal = error
-        order.outcome = Outcome(
-            order.request,
-            now.ns,
-            self.active,
-            move,
-            pending=order.pending,
-            unknown=(self._at_rest or self.observer).unknown,
-            creep_held=held,
-            refusal=refusal,
-        )
-        if refusal is not None:
+        except Refusal as refusal:
             self.refused += 1
+            order.refusal = refusal
             effects.append(Log("warning", f"refused: {refusal}"))
         # What became of a command is published when the driver has said so.
-        if not dry_run and (refusal is not None or order.pending):
-            effects.append(PublishState(order.outcome))
-        return order, effects
+        if not dry_run and (order.refusal is not None or order.pending):
+            effects.append(PublishState(order))
+        return effects
 
     def _refuse(self, order: Order, refusal: Refusal, now: Moment) -> list[Effect]:
         """Refuse an order that was not refused at once."""
         self.refused += 1
-        order.outcome = Outcome(order.request, now.ns, refusal=refusal)
-        return [Log("warning", f"refused: {refusal}"), PublishState(order.outcome)]
+        order.began, order.move, order.refusal, order.answered = now, None, refusal, True
+        return [Log("warning", f"refused: {refusal}"), PublishState(order)]
 
-    def _go(self, order: Order, move: Move, now: Moment, held: bool) -> list[Effect]:
-        """The command of `move`, whose shape is to stand from now on, `held` against creep."""
-        assert self.active is not None
-        order.began, request, before = now.steady, order.request, self.monitor.shape
-        command = SendCommand(move.signals, now.ns, 0, request.holder, request.take_over)
-        effects: list[Effect] = [command]
-        if before is not None and before.sent.order is not None:
+    def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
+        """The command of `move`, whose shape is to stand from now on."""
+        request = order.request
+        order.command = SendCommand(move.signals, now, 0, request.holder, request.take_over)
+        order.checked = now.time
+        effects: list[Effect] = [order.command]
+        if (before := self.monitor.order) is not None and not before.answered:
             effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
-        sent = Sent(command, order, now.time, now.steady)
-        shape = CommandedShape(move, self.active.planner, sent, held, now.time, began=now.time)
-        self.monitor.shape = self.hold.shape = shape
+        self.monitor.order = self.hold.order = order
         return effects
 
     # --- a degauss on the way ---
@@ -260,7 +257,7 @@ class FocusController:
             return []
         if refusal is not None:
             return self._refuse(order, refusal, now)
-        return self._attempt(order, now, degaussed=run.steps if run is not None else 0)[1]
+        return self._attempt(order, now, degaussed=run.steps if run is not None else 0)
 
     # --- time ---
 
@@ -273,11 +270,11 @@ class FocusController:
         effects: list[Effect] = []
         if failure := self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady):
             effects += self._degauss_ended(now, failure)
-        if (untaken := self.monitor.untaken(now.steady)) is not None:
-            order, refusal = untaken
+        order = self.monitor.order
+        if order is not None and (untaken := self.monitor.untaken(now.steady)) is not None:
             self.hold.end("the driver did not take the command")
-            # A correction, or the end of a move, answers no order.
-            effects += self._refuse(order, refusal, now) if order is not None else [Log("warning", str(refusal))]
+            # A correction, or the end of a move, is no answer to the request.
+            effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
         correction = self.hold.command(self.monitor.latest, self.observer.estimate, now)
         return [*effects, *self._news(now), *([] if correction is None else [correction])]
 
@@ -287,12 +284,12 @@ class FocusController:
 
     def stop(self, order: Order, now: Moment) -> list[Effect] | None:
         """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
-        report, shape = self.monitor.latest, self.monitor.shape
-        if shape is None or not self.monitor.keeps(order):
+        report, last = self.monitor.latest, self.monitor.order
+        if last is None or not self.monitor.keeps(order):
             return None
         self.hold.end("the move was cancelled")
-        shape.kept = False
+        last.kept = False
         effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
         if report is not None and len(report.applied):
-            effects.append(shape.send_on(np.array(report.applied), now))
+            effects.append(last.send_on(np.array(report.applied), now))
         return effects

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorEstimate, Calibration, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import ErrorCode
-from dm_common.messages import doubles, time_message
+from dm_common.messages import doubles, estimate_message, time_message
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
-from dm_controller.focus_types import Moment, Outcome
+from dm_controller.focus_types import Moment, Order
 from dm_controller.forecast import HysteresisShare
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
@@ -23,22 +23,22 @@ from dm_controller.planning.target import FocusTarget
 CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
 
 
-def state_message(outcome: Outcome, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
-    """What came of a request, with the prediction in full.
+def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
+    """What came of an order, with the prediction in full.
 
     Args:
         values: parameters of the node.
         share: knows of the actuators' hysteresis where the calibration does not; None = nothing does.
     """
-    request, move, active, refusal = outcome.request, outcome.move, outcome.active, outcome.refusal
+    request, move, active, refusal = order.request, order.move, order.active, order.refusal
     state = without_figures(FocusState()) if move is None else FocusState()
     state.curvature, state.power, state.conic_constant = (
         request.curvature,
         2 * request.curvature,
         request.conic_constant,
     )
-    state.mode, state.applied = request.mode, outcome.applied
-    state.header.stamp = time_message(outcome.stamp_ns)
+    state.mode, state.applied = request.mode, order.applied
+    state.header.stamp = time_message(order.began.ns)
     if move is not None and active is not None:
         plan = move.plan
         state.calibration_id = active.calibration.id
@@ -56,16 +56,24 @@ def state_message(outcome: Outcome, values: Mapping[str, Any], share: Hysteresis
         state.curvature_min, state.curvature_max = active.reachable_range(move.target, values["reachable_tolerance"])
         state.history_known = move.known
         state.mode = move.mode
-        state.creep_held = outcome.creep_held
-        first = "the mirror is degaussed first; " if outcome.pending else ""
+        state.creep_held = order.creep_held
+        first = "the mirror is degaussed first; " if order.pending else ""
         text = (
             f"{first}{request.curvature:+.4f} 1/m stands in about {move.duration:.2g} s, right to "
             f"{plan.max_zernike_upper * 1e9:.1f} nm (largest coefficient, 95 %)"
         )
-        state.message = "; ".join(filter(None, (text, remarks(active, outcome.unknown, values, outcome.stamp_ns))))
+        state.message = "; ".join(filter(None, (text, remarks(active, order.unknown, values, order.began.ns))))
     if refusal is not None:
         state.error_code, state.message = refusal.error_code, str(refusal)
     return state
+
+
+def actuator_estimate_message(controller: FocusController) -> ActuatorEstimate:
+    """What is known of the actuators."""
+    message, active = estimate_message(controller.observer), controller.active
+    if active is not None:
+        message.calibration_id, message.revision = active.calibration.id, active.calibration.revision
+    return message
 
 
 def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], now_ns: int) -> str:
@@ -103,13 +111,20 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
         "held": controller.hold.active,
         "corrections": controller.hold.corrections,
     }
-    shape, report = controller.monitor.shape, controller.monitor.latest
-    if shape is not None and shape.kept and report and same_signals(report.requested, shape.sent.command.signals):
-        figures |= {
-            "curvature": shape.move.target.curvature,
-            "age": f"{now.time - shape.began:.1f}",
-            "bound": shape.bound(not controller.observer.unknown),
-        }
+    order, report = controller.monitor.order, controller.monitor.latest
+    if order is not None and order.move is not None and order.kept and report is not None:
+        assert order.command is not None and order.active is not None  # it is the last that went out
+        if same_signals(report.requested, order.command.signals):
+            plan, known = order.move.plan, not controller.observer.unknown
+            # What was written again after a lost link is on another branch of the hysteresis than it was found for.
+            error = order.active.planner.error_bound(
+                known or not order.move.known, plan.max_zernike_upper - plan.max_zernike
+            )
+            figures |= {
+                "curvature": order.move.target.curvature,
+                "age": f"{now.time - order.began.time:.1f}",
+                "bound": plan.max_zernike + error,
+            }
     text = trouble(controller, values, now)
     return Health(WARN if text else OK, text or "ready", figures)
 

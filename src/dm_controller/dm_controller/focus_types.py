@@ -8,7 +8,7 @@ from dm_msgs.msg import FocusRequest
 from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.planner import Move, Planner
+from dm_controller.planning.planner import Move
 
 
 class Moment(NamedTuple):
@@ -27,51 +27,75 @@ class Moment(NamedTuple):
     simulated: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of a request so far.
+@dataclass(eq=False)
+class SendCommand:
+    """Publish this actuator command; the controller notes in it what the driver makes of it.
 
     Attributes:
-        request: what was asked for.
-        stamp_ns: of the command, where one went out; else of the judgement.
-        active: the calibration in use; None = there was none.
-        move: None = refused before one was planned.
-        applied: the driver has confirmed the command.
-        pending: the mirror is degaussed first.
-        unknown: the reason why the actuators' history is not known; "" = it is.
-        creep_held: the shape is corrected for creep from now on.
-        refusal: None = not refused.
+        signals: (N,)
+        sent: when; its header has the stamp.
+        expected_turns: it counts only while the driver reports so many; 0 = in any case.
+        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
+        take_over: even if somebody else holds it.
+        confirmed: the driver reported it as its own.
+        lost: the driver was started anew since, and knows nothing of it.
+        given_up: the driver did not report it in time, and that was said.
     """
 
-    request: FocusRequest
-    stamp_ns: int
-    active: ActiveCalibration | None = None
-    move: Move | None = None
-    applied: bool = False
-    pending: bool = False
-    unknown: str = ""
-    creep_held: bool = False
-    refusal: Refusal | None = None
+    signals: Floats
+    sent: Moment
+    expected_turns: int = 0
+    holder: str = ""
+    take_over: bool = False
+    confirmed: bool = False
+    lost: bool = False
+    given_up: bool = False
 
 
 @dataclass(eq=False)
 class Order:
-    """A request on its way through the controller, which alone changes it.
+    """A request on its way through the controller, which alone changes it; the last one is also the shape that stands.
+
+    `DriverMonitor` watches that shape come about, `CreepHold` keeps it.
 
     Attributes:
-        outcome: the latest.
+        request: what was asked for.
+        began: when it was judged last, or refused since; its command goes out at the same time.
+        active: the calibration in use then; None = there was none.
+        move: None = refused before one was planned, or after.
+        unknown: the reason why the actuators' history was not known then; "" = it was.
+        refusal: None = not refused.
         pending: the mirror is degaussed first.
-        began: s, steady, when it was given or its command went out.
+        applied: the driver has confirmed the command.
+        answered: what came of its command has been said.
         taken: the driver was seen to follow its command.
         gap: largest distance from its shape seen, normalised.
+        command: the last one for its shape; None = none went out.
+        creep_held: its shape is corrected for creep from its command on, until that is ended.
+        checked: s, ROS time, when creep was looked at last.
+        kept: its move was not stopped.
     """
 
     request: FocusRequest
-    outcome: Outcome
+    began: Moment
+    active: ActiveCalibration | None = None
+    move: Move | None = None
+    unknown: str = ""
+    refusal: Refusal | None = None
     pending: bool = False
-    began: float = 0.0
+    applied: bool = False
+    answered: bool = False
     taken: bool = False
     gap: float = 0.0
+    command: SendCommand | None = None
+    creep_held: bool = False
+    checked: float = 0.0
+    kept: bool = True
+
+    def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
+        """Another command for its shape, on behalf of the same holder."""
+        self.command = SendCommand(signals, now, expected_turns, self.request.holder)
+        return self.command
 
 
 class Progress(NamedTuple):
@@ -95,25 +119,6 @@ class Progress(NamedTuple):
 # --- commands and events ---
 
 
-@dataclass(frozen=True, eq=False)
-class SendCommand:
-    """Publish this actuator command.
-
-    Attributes:
-        signals: (N,)
-        stamp_ns: of its header.
-        expected_turns: it counts only while the driver reports so many; 0 = in any case.
-        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
-        take_over: even if somebody else holds it.
-    """
-
-    signals: Floats
-    stamp_ns: int
-    expected_turns: int = 0
-    holder: str = ""
-    take_over: bool = False
-
-
 class StartDegauss(NamedTuple):
     """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`.
 
@@ -127,13 +132,17 @@ class StartDegauss(NamedTuple):
 
 
 class PublishState(NamedTuple):
-    """Publish what came of a request."""
+    """Publish what came of an order."""
 
-    outcome: Outcome
+    order: Order
 
 
 class PublishCapabilities(NamedTuple):
     """What the mirror can do has changed."""
+
+
+class PublishEstimate(NamedTuple):
+    """What is known of the actuators has changed."""
 
 
 class Log(NamedTuple):
@@ -143,65 +152,4 @@ class Log(NamedTuple):
     text: str
 
 
-# --- what was commanded ---
-
-
-@dataclass(eq=False)
-class Sent:
-    """A command that went out.
-
-    Attributes:
-        order: that it answers; None = it corrects a shape for creep, or stops its move.
-        time, steady: s, when.
-        confirmed: the driver reported it as its own.
-        lost: the driver was started anew since, and knows nothing of it.
-        given_up: the driver did not report it in time, and that was said.
-    """
-
-    command: SendCommand
-    order: Order | None
-    time: float
-    steady: float
-    confirmed: bool = False
-    lost: bool = False
-    given_up: bool = False
-
-
-@dataclass(eq=False)
-class CommandedShape:
-    """The shape that was commanded last: `DriverMonitor` watches it come about, `CreepHold` keeps it.
-
-    Attributes:
-        move: to it.
-        planner: of the move.
-        sent: the last command for it.
-        held: it is corrected for creep.
-        checked: s, ROS time, when creep was looked at last.
-        kept: its move was not stopped.
-        began: s, ROS time, when it was commanded first.
-    """
-
-    move: Move
-    planner: Planner
-    sent: Sent
-    held: bool
-    checked: float
-    kept: bool = True
-    began: float = 0.0
-
-    def bound(self, known: bool) -> float:
-        """m, 95 % bound on its largest coefficient error, with the history of the actuators `known` to this day or not.
-
-        What was written again after a lost link is on another branch of the hysteresis than it was found for.
-        """
-        plan, lost = self.move.plan, self.move.known and not known
-        return plan.max_zernike + self.planner.error_bound(not lost, plan.max_zernike_upper - plan.max_zernike)
-
-    def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
-        """Another command for the shape that was commanded last, on behalf of the same holder."""
-        command = SendCommand(signals, now.ns, expected_turns, self.sent.command.holder)
-        self.sent = Sent(command, None, now.time, now.steady)
-        return command
-
-
-Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | Log
+Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | PublishEstimate | Log

@@ -43,11 +43,11 @@ class LoopHost:
 
     def target(self, request: FocusRequest) -> FocusTarget:
         """The target of a request that could be carried out. Raises Refusal, as for a move."""
-        outcome = self._node.order(request, dry_run=True).outcome
-        if outcome.refusal is not None:
-            raise outcome.refusal
-        assert outcome.move is not None  # else it is refused
-        return outcome.move.target
+        order = self._node.order(request, dry_run=True)
+        if order.refusal is not None:
+            raise order.refusal
+        assert order.move is not None  # else it is refused
+        return order.move.target
 
     def active_calibration(self) -> ActiveCalibration:
         """The calibration in use. Raises Refusal."""

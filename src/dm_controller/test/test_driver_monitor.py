@@ -11,7 +11,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles, time_message
 from dm_controller.driver_monitor import CONFIRM_S, DriverMonitor
-from dm_controller.focus_types import CommandedShape, Moment, Order, Outcome, SendCommand, Sent
+from dm_controller.focus_types import Moment, Order, SendCommand
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget
 
@@ -29,19 +29,17 @@ def report(requested: np.ndarray = HERE, sequence: int = 1, **fields: Any) -> Ac
     return made
 
 
-def command(driver: DriverMonitor, signals: np.ndarray, order: Order | None) -> None:
+def command(driver: DriverMonitor, signals: np.ndarray) -> None:
     """A command goes out, one second after the epoch."""
-    none: Any = None  # neither prediction nor planner
-    move = Move(FocusTarget(0.01), signals, signals, 0.0, True, 0.0, none)
-    sent = Sent(SendCommand(signals, 10**9), order, 1.0, BEGAN)
-    driver.shape = CommandedShape(move, none, sent, held=False, checked=1.0)
+    none: Any = None  # no prediction
+    move, now = Move(FocusTarget(0.01), signals, signals, 0.0, True, 0.0, none), Moment(10**9, 1.0, BEGAN)
+    driver.order = Order(FocusRequest(curvature=0.01), now, move=move, command=SendCommand(signals, now))
 
 
 def monitor(timeout: float = TIMEOUT) -> DriverMonitor:
     made = DriverMonitor({"driver_timeout": timeout})
     made.observe(report(), BEGAN)
-    request = FocusRequest(curvature=0.01)
-    command(made, THERE, Order(request, Outcome(request, 0)))
+    command(made, THERE)
     return made
 
 
@@ -86,10 +84,8 @@ def test_a_command_that_is_not_confirmed_is_told_of_once(last: ActuatorState | N
     later = BEGAN + TIMEOUT + 0.1
     if last is not None:
         driver.observe(last, later)
-    untaken = driver.untaken(later)
-    assert untaken is not None
-    order, refusal = untaken
-    assert order is not None and order.request.curvature == 0.01
+    refusal = driver.untaken(later)
+    assert refusal is not None
     assert refusal.error_code == code
     assert text in str(refusal)
     assert driver.untaken(later) is None
@@ -99,12 +95,12 @@ def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_not
     driver = monitor(timeout=0.0)
     assert driver.untaken(BEGAN + 0.9 * CONFIRM_S) is None
     untaken = driver.untaken(BEGAN + 1.1 * CONFIRM_S)
-    assert untaken is not None and untaken[1].error_code == ErrorCode.PREEMPTED
+    assert untaken is not None and untaken.error_code == ErrorCode.PREEMPTED
     driver = monitor(timeout=0.0)
-    assert driver.shape is not None
-    driver.shape.sent.steady = BEGAN + 1.0  # no report has come since
+    assert driver.order is not None and driver.order.command is not None
+    driver.order.command.sent = Moment(10**9, 1.0, BEGAN + 1.0)  # no report has come since
     untaken = driver.untaken(BEGAN + 1.0 + 1.1 * CONFIRM_S)
-    assert untaken is not None and untaken[1].error_code == ErrorCode.TIMEOUT
+    assert untaken is not None and untaken.error_code == ErrorCode.TIMEOUT
 
 
 def test_a_driver_that_was_started_anew_is_noticed() -> None:
@@ -132,7 +128,7 @@ def test_a_command_that_a_driver_started_anew_cannot_know_is_lost_at_once(
     untaken = driver.untaken(BEGAN + 0.1)
     assert (untaken is not None) == lost
     if untaken is not None:
-        assert untaken[1].error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(untaken[1])
+        assert untaken.error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(untaken)
 
 
 def test_the_latency_is_from_the_command_to_its_first_write() -> None:
@@ -140,7 +136,7 @@ def test_the_latency_is_from_the_command_to_its_first_write() -> None:
     assert driver.latency == 0.0
     assert driver.observe(report(THERE, stamp_ns=10**9 + 2_000_000), BEGAN)
     assert driver.latency == pytest.approx(2e-3)
-    command(driver, HERE, None)
+    command(driver, HERE)
     assert not driver.observe(report(HERE, stamp_ns=10**9 + 4_000_000), BEGAN)
     assert driver.latency == pytest.approx(3e-3)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -35,7 +36,6 @@ from dm_controller.focus_types import (
     Log,
     Moment,
     Order,
-    Outcome,
     PublishCapabilities,
     PublishState,
     SendCommand,
@@ -138,7 +138,7 @@ class Bench:
         self.state = ActuatorState.STATE_ACTIVE
         self.holder = ""
         self.commands: list[SendCommand] = []
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[Order] = []  # as they were when they were published
         self.degauss_runs: list[StartDegauss] = []
         self.capabilities = 0
         self.log: list[str] = []
@@ -158,7 +158,7 @@ class Bench:
                 if self.obeys and effect.expected_turns in (0, self.turns):
                     self.move(effect.signals)
             elif isinstance(effect, PublishState):
-                self.outcomes.append(effect.outcome)
+                self.outcomes.append(copy(effect.order))
             elif isinstance(effect, StartDegauss):
                 self.degauss_runs.append(effect)
             elif isinstance(effect, PublishCapabilities):
@@ -232,8 +232,8 @@ def bench() -> Bench:
 
 
 def move_of(order: Order) -> Any:
-    assert order.outcome is not None and order.outcome.move is not None
-    return order.outcome.move
+    assert order.move is not None
+    return order.move
 
 
 def test_it_needs_no_ros() -> None:
@@ -245,7 +245,7 @@ def test_a_request_becomes_a_command_and_then_a_state(bench: Bench) -> None:
     order, effects = bench.controller.request(FocusRequest(curvature=0.01), bench.now)
     assert [type(effect) for effect in effects] == [SendCommand]  # the state follows the driver's confirmation
     bench.do(effects)
-    assert bench.outcomes == [order.outcome]
+    assert [outcome.request for outcome in bench.outcomes] == [order.request]
     assert bench.outcomes[0].applied and bench.outcomes[0].creep_held and bench.outcomes[0].unknown == ""
     assert bench.controller.monitor.progress(order, bench.time).stands
     assert bench.controller.monitor.latency == 0.0
@@ -262,7 +262,7 @@ def test_a_mirror_without_creep_is_not_held(bench: Bench) -> None:
 
 def test_a_dry_run_changes_nothing(bench: Bench) -> None:
     order = bench.ask(dry_run=True)
-    assert order.outcome is not None and order.outcome.move is not None
+    assert order.move is not None
     assert not (bench.commands or bench.outcomes)
     assert not bench.controller.hold.active
 
@@ -383,7 +383,7 @@ def test_who_holds_the_mirror_has_it_alone(bench: Bench) -> None:
 def test_applied_is_what_the_driver_confirmed(bench: Bench) -> None:
     bench.obeys = False
     first = bench.ask(0.01)
-    assert not bench.outcomes and not first.outcome.applied
+    assert not bench.outcomes and not first.applied
     bench.ask(0.02)
     assert bench.outcomes[-1].request.curvature == 0.01 and not bench.outcomes[-1].applied
     assert bench.refusal().error_code == ErrorCode.PREEMPTED
@@ -468,14 +468,14 @@ def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     bench.controller.observer.recall(rested)
     bench.report()
     before = bench.ask(dry_run=True)
-    assert before.outcome is not None and "moved before" in before.outcome.unknown
+    assert "moved before" in before.unknown
     told = bench.capabilities
     bench.degauss()
     bench.time += 60.0  # what the moment between record and report may have left has faded
     bench.report()
     assert bench.capabilities > told
     after = bench.ask(dry_run=True)
-    assert after.outcome is not None and after.outcome.unknown == ""
+    assert after.unknown == ""
     assert move_of(after).plan.max_zernike_upper < 0.1 * move_of(before).plan.max_zernike_upper
 
 
@@ -491,8 +491,7 @@ def test_what_is_offered_is_what_requests_are_promised() -> None:
 def test_lost_turns_make_the_history_unknown(bench: Bench) -> None:
     bench.turns += 5
     bench.move(np.full(ACTUATORS, 0.1))
-    outcome = bench.ask(dry_run=True).outcome
-    assert outcome is not None and "turns were not seen" in outcome.unknown
+    assert "turns were not seen" in bench.ask(dry_run=True).unknown
 
 
 # --- a degauss on the way ---
@@ -529,8 +528,8 @@ def test_the_newest_request_follows_the_degauss(bench: Bench) -> None:
     bench.report()
     first, second = bench.ask(0.01, time_budget=60.0), bench.ask(0.02)
     assert len(bench.degauss_runs) == 1
-    assert first.outcome is not None and first.outcome.refusal is not None
-    assert first.outcome.refusal.error_code == ErrorCode.PREEMPTED
+    assert first.refusal is not None
+    assert first.refusal.error_code == ErrorCode.PREEMPTED
     bench.ask(9.0)  # refused; the one before goes on waiting
     assert second.pending
     bench.degauss()
@@ -617,7 +616,7 @@ def test_a_degauss_that_fails_ends_the_order(
     accident(bench)
     bench.do(bench.controller.tick(bench.now))
     assert bench.refusal().error_code == code and text in str(bench.refusal())
-    assert order.outcome is bench.outcomes[-1] and bench.commands == []
+    assert order.request is bench.outcomes[-1].request and bench.commands == []
     # An answer that comes too late counts for nothing.
     assert bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2) == []
 
@@ -675,7 +674,7 @@ def test_a_driver_that_does_not_take_the_command(bench: Bench) -> None:
         bench.do(bench.controller.tick(bench.now))
     assert bench.refusal().error_code == ErrorCode.PREEMPTED
     assert "has not confirmed the command" in str(bench.refusal())
-    assert order.outcome is bench.outcomes[-1] and len(bench.outcomes) == 1
+    assert order.request is bench.outcomes[-1].request and len(bench.outcomes) == 1
     assert not bench.controller.hold.active
 
 
