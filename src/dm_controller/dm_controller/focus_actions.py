@@ -31,6 +31,8 @@ from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
 #: Longest that a confirmation takes beyond the time after which the controller itself gives a command up, s.
 GRACE_S = 1.0
+#: Longest time after the start in which a request waits for what others have said before, s.
+START_S = 3.0
 
 
 class FocusHost(ManagedNode, ABC):
@@ -49,6 +51,7 @@ class FocusHost(ManagedNode, ABC):
     ) -> None:
         super().__init__(name, table, on_change, **keywords)
         self._lock, self._controller = threading.Lock(), FocusController(self._values)
+        self._started = time.monotonic()
 
     @abstractmethod
     def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
@@ -89,6 +92,15 @@ class FocusHost(ManagedNode, ABC):
             so_far = copy(order)
         return self.state(so_far)
 
+    def await_start(self) -> None:
+        """Wait until calibration and driver have been heard of, which takes a moment after the start; START_S then."""
+        while time.monotonic() < self._started + START_S:
+            with self.controller() as (controller, now):
+                refusal = controller.unavailable(now)
+            if refusal is None or refusal.error_code not in (ErrorCode.NOT_CALIBRATED, ErrorCode.DRIVER_UNAVAILABLE):
+                return
+            time.sleep(POLL_S)
+
 
 class FocusServices:
     """Serves `set_focus` and `flatten` in worker threads, for the driver's confirmation is waited for.
@@ -111,6 +123,7 @@ class FocusServices:
         return self._answer(flat, request.dry_run, response)
 
     def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
+        self._node.await_start()
         order = self._node.order(request, dry_run)
         deadline = time.monotonic() + GRACE_S + (self._driver_timeout() or CONFIRM_S)
         while waits := not (dry_run or order.pending or order.applied or order.refusal):
@@ -152,6 +165,7 @@ class MoveFocusAction:
         if self._to_stop(handle):
             return self._stopped(handle, None)
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
+        node.await_start()
         if goal.tolerance > 0.0:
             preview = node.state(node.order(goal.request, dry_run=True))
             if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:

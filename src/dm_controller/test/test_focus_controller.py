@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,6 +31,7 @@ from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.messages import doubles, time_message
 from dm_common.optics.zernike import basis
+from dm_controller.focus_actions import START_S, FocusHost
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health
 from dm_controller.focus_types import (
@@ -348,6 +351,20 @@ def test_a_request_that_makes_no_sense_is_told_so_without_a_calibration_too(benc
     assert bench.refusal().error_code == ErrorCode.NOT_FINITE
     bench.ask(0.01)
     assert bench.refusal().error_code == ErrorCode.NOT_CALIBRATED
+
+
+def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its_way(bench: Bench) -> None:
+    fresh = FocusController(VALUES)
+    fresh.use(None, None)
+    refusal = fresh.unavailable(bench.now)
+    assert refusal is not None and "comes within seconds of this node's start" in str(refusal)
+    asked = iter([fresh, fresh, bench.controller])
+    started = time.monotonic()
+    host = cast(Any, SimpleNamespace(_started=started, controller=lambda: nullcontext((next(asked), bench.now))))
+    FocusHost.await_start(host)
+    assert not list(asked)
+    host._started -= START_S
+    FocusHost.await_start(host)  # it asks no more
 
 
 def test_the_newest_request_wins(bench: Bench) -> None:

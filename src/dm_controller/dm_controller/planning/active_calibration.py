@@ -22,6 +22,8 @@ from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
 NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
+#: Where none was heard of; it goes for the first moments of the node.
+NOT_YET = "one that is in use already comes within seconds of this node's start"
 #: What to do where `hold_tilt` is true and cannot be.
 NO_TILT = (
     "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
@@ -116,7 +118,8 @@ def active_calibration(
         Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
     """
     if calibration is None or not calibration.id:
-        raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
+        text = NO_CALIBRATION if calibration is not None else f"{NO_CALIBRATION}; {NOT_YET}"
+        raise Refusal(ErrorCode.NOT_CALIBRATED, text)
     if mirror is None:
         raise Refusal(
             ErrorCode.DRIVER_UNAVAILABLE, "the mirror's limits are unknown: no mirror_info from pdm_driver yet"
