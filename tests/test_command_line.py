@@ -223,9 +223,11 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
     assert "1266 nm (95 % bound), " in verdict(1265.6e-9, 1e-9)
     assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     state = FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True)
+    state.message = "right to 1.3 nm; most of that for creep"
     _show(state, Calibration(wavelength=632.8e-9, instrument_error=4e-9, scale_error=1e-9, aperture_radius=0.011))
     said = capsys.readouterr().out
     assert "promised 1.3 nm (95 % bound, λ/487)" in said and "0.00 nm" not in said
+    assert "\nmost of that for creep\n" in said
     assert "repeatable to 1.3 nm (λ/487), absolute to 4.2 nm (λ/150), limited by the instrument's own error" in said
 
 

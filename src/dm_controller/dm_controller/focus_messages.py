@@ -62,7 +62,8 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
             f"{first}{request.curvature:+.4f} 1/m stands in about {move.duration:.2g} s, right to "
             f"{plan.max_zernike_upper * 1e9:.1f} nm (largest coefficient, 95 %)"
         )
-        state.message = "; ".join(filter(None, (text, remarks(active, order.unknown, values, order.began.ns))))
+        most = f"most of that for {plan.most}" if plan.most else ""
+        state.message = "; ".join(filter(None, (text, most, remarks(active, order.unknown, values, order.began.ns))))
     if refusal is not None:
         state.error_code, state.message = refusal.error_code, str(refusal)
     return state

@@ -33,7 +33,7 @@ from dm_common.messages import doubles, time_message
 from dm_common.optics.zernike import basis
 from dm_controller.focus_actions import START_S, FocusHost
 from dm_controller.focus_controller import FocusController
-from dm_controller.focus_messages import capabilities_message, health
+from dm_controller.focus_messages import capabilities_message, health, state_message
 from dm_controller.focus_types import (
     Effect,
     Log,
@@ -434,6 +434,10 @@ def test_a_degauss_does_not_cure_old_creep() -> None:
     bench.report()
     later = bench.ask(dry_run=True)
     assert move_of(later).plan.max_zernike_upper < 0.3 * move_of(soon).plan.max_zernike_upper
+    assert "most of that for creep of what the mirror held before it was" in state_message(soon, VALUES, None).message
+    bench.time += 1e8
+    bench.report()
+    assert "most of that" not in state_message(bench.ask(0.0, dry_run=True), VALUES, None).message
 
 
 def test_a_day_that_the_clock_jumps_is_no_day_of_creep_that_is_known() -> None:

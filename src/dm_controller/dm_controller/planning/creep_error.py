@@ -27,10 +27,12 @@ class CreepBound(NamedTuple):
     Attributes:
         max_zernike: of the largest coefficient error beyond tilt.
         rms: of the rms sag error, piston and tilt removed.
+        unseen: whether most of the first is of what was held before the mirror was followed.
     """
 
     max_zernike: float
     rms: float
+    unseen: bool = False
 
 
 class CreepShown(NamedTuple):
@@ -110,7 +112,8 @@ class CreepError:
         same = np.minimum(shown.sigma * np.exp(-np.maximum(state.time - shown.time, 0.0) / time), state.crept_sigma)
         since = np.sqrt(np.square(state.crept_sigma) - np.square(same))
         figure = 0.0 if measured else self._share * shown.sigma
-        shared += np.square((same * faded - figure) @ self._unseen.T) + np.square((since * faded) @ self._unseen.T)
+        unseen = np.square((same * faded - figure) @ self._unseen.T) + np.square((since * faded) @ self._unseen.T)
+        shared += unseen
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
         if not measured:
             at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
@@ -120,7 +123,9 @@ class CreepError:
         count = self._coefficients
         largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
         rms = (shared + each)[:, count:].sum(axis=1)
-        return CreepBound(float(np.sqrt(largest.max())), ONE * float(np.sqrt(rms.max())))
+        worst = int(largest.argmax())
+        most = bool(ONE**2 * unseen[worst, :count].max() > 0.5 * largest[worst])
+        return CreepBound(float(np.sqrt(largest[worst])), ONE * float(np.sqrt(rms.max())), most)
 
 
 def _default_covariance(law: HysteresisModel) -> Floats:

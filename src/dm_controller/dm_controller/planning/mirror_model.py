@@ -107,6 +107,7 @@ class Plan:
     max_zernike: float
     max_zernike_upper: float
     saturated: NDArray[np.bool_]
+    most: str = ""  # what most of the bound comes from, where that is much more than the calibration's own
 
 
 def rms_bounds(rms: float, spread: float) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_boun
 from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
-    from dm_controller.planning.creep_error import CreepError, CreepShown
+    from dm_controller.planning.creep_error import CreepBound, CreepError, CreepShown
 
 #: When a shape is to be right unless configured otherwise, s after the way.
 SETTLE_S = 0.05
@@ -35,6 +35,8 @@ DRAWS = 4000
 RANGE_TOLERANCE = 20e-9
 #: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
+#: A bound of creep so many times that of all else is named.
+MUCH = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +168,7 @@ class Planner:
             plan = mirror.predict(target, reached)
             if error is not None:
                 plan = replace(plan, max_zernike=largest)
-            creep = (0.0, 0.0)
+            creep = None
             if law.creep_rate:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
@@ -235,19 +237,23 @@ class Planner:
             error = model.held_out_max_zernike if found is None else self.law.in_use * found.held_out_max_zernike
         return math.hypot(error, 0.0 if known else self.unknown_max_zernike)
 
-    def _bounded(
-        self, plan: Plan, signals: Floats, known: bool, creep: tuple[float, float], error: float | None
-    ) -> Plan:
-        rms_spread = math.hypot(self.mirror.model.held_out_rms, 0.0 if known else self._unknown_rms, creep[1] / 1.96)
+    def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:
+        crept, crept_rms = (creep.max_zernike, creep.rms) if creep is not None else (0.0, 0.0)
+        rms_spread = math.hypot(self.mirror.model.held_out_rms, 0.0 if known else self._unknown_rms, crept_rms / 1.96)
         largest_spread = self.error_bound(known, None if error is None else error - plan.max_zernike)
+        most = ""
+        if creep is not None and crept > MUCH * largest_spread:
+            held = "of what the mirror held before it was followed, which fades over hours"
+            most = f"creep {held if creep.unseen else 'that the calibration leaves open'}"
         rms_lower, rms_upper = rms_bounds(plan.rms, rms_spread)
         return replace(
             plan,
             signals=signals,
             rms_lower=rms_lower,
             rms_upper=rms_upper,
-            max_zernike_upper=plan.max_zernike + math.hypot(largest_spread, creep[0]),
+            max_zernike_upper=plan.max_zernike + math.hypot(largest_spread, crept),
             saturated=self.mirror.limits.at_limit(signals),
+            most=most,
         )
 
     def _unknown_history(self) -> tuple[float, float]:

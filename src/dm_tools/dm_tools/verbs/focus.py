@@ -96,8 +96,8 @@ def _show(state: Any, calibration: Any) -> None:
         console.print(two_fold(state.predicted_max_zernike_upper, calibration, state.curvature), soft_wrap=True)
     if state.saturated:
         console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
-    if not state.history_known:
-        console.print("[yellow]the actuators' history is not known[/]: after ./dm degauss the promise is narrower")
+    if remarks := state.message.partition("; ")[2]:
+        console.print(remarks, style="yellow", markup=False, soft_wrap=True)
 
 
 def _held(state: Any) -> str:
