@@ -439,9 +439,11 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
     wait_until(on_it, 60, "tracking of the moved object")
     other = SetFocusDistance.Request(distance=7.0, holder="operator")
     assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.BUSY
-    other.take_over = True
+    other.dry_run = True
     assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.OK
-    assert [(request.holder, request.take_over) for request in scene.asked] == [("operator", True)]
+    other.dry_run, other.take_over = False, True
+    assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.OK
+    assert [(request.holder, request.take_over) for request in scene.asked] == [("operator", False), ("operator", True)]
     stack = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
     assert (stack.error_code, stack.message) == (
         ErrorCode.BUSY,

@@ -252,6 +252,14 @@ def test_what_waits_for_the_mirror_waits_until_the_map_can_be_judged(
     assert answer.accepted, answer.message
 
 
+def test_a_dry_run_goes_on_while_somebody_else_holds_the_mirror(suite: Suite) -> None:
+    suite.shape()
+    suite.bench.hold.ask(HoldMirror.Request.HOLD, "operator", "a test", 0.0, 60.0)
+    assert suite.call().error_code == ErrorCode.BUSY
+    answer = suite.call(dry_run=True)
+    assert answer.accepted and suite.bench.hold.holder == "operator", answer.message
+
+
 def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
     quality = suite.calibration.quality
     before = np.array(suite.calibration.influence_sag)

@@ -68,7 +68,7 @@ class AutofocusNode(ManagedNode):
                 ErrorCode.INVALID_ARGUMENT,
                 f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
             )
-        if not request.take_over:
+        if not (request.take_over or request.dry_run):
             self._probe.refuse_if_used()
         response.dioptre = dioptre_of(request.distance) or request.dioptre
         response.distance = distance_of(response.dioptre)

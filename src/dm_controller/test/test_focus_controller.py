@@ -386,6 +386,7 @@ def test_who_holds_the_mirror_has_it_alone(bench: Bench) -> None:
     bench.report()
     bench.ask(0.02)
     assert bench.refusal().error_code == ErrorCode.BUSY and "calibration holds it" in str(bench.refusal())
+    assert bench.ask(0.02, dry_run=True).refusal is None
     bench.wait(30.0)
     assert len(bench.commands) == 1 and bench.controller.hold.active
     bench.ask(0.02, holder="calibration")

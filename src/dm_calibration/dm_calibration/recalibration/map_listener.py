@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -64,8 +65,7 @@ class MapListener:
         busy: Callable[[], bool],
     ) -> None:
         self._node, self._values = node, values
-        self._manager, self._services = manager, services
-        self._busy = busy
+        self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self._history = AppliedHistory()
         self._law: HysteresisModel | None = None
@@ -74,8 +74,7 @@ class MapListener:
         self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
         self._last_refusal = ""
-        self._dirty = False
-        self._was_stale = False
+        self._dirty = self._was_stale = False
         self._published_at = float("-inf")
         self._temperatures = TemperatureLog(node, lambda: values["temperature.silent_after"])
         services.temperature = self._temperatures.at
@@ -141,12 +140,11 @@ class MapListener:
     def tick(self) -> None:
         """Publish what is due; called about once a second by the node."""
         stale = self._stale
-        due = time.monotonic() - self._published_at >= PUBLISH_PERIOD_S
         kept = self._updates.in_use
         warmed = kept is not None and kept.drift.thermal_trust > 0.0 and self._temperatures.changed
-        if (self._dirty or stale != self._was_stale or warmed) and due:
+        if self._dirty or stale != self._was_stale or warmed:
             self._was_stale = stale
-            self._manager.publish_again()
+            self._changed()
 
     def _changed(self) -> None:
         """Publish now, or with the next tick when the last message is less than a second old."""
@@ -251,7 +249,13 @@ class MapListener:
         with self._turn:
             timeout = self._values["driver_timeout"]
             self._services.hold.wait_for(lambda: not self._busy(), request, "a calibration is running", timeout)
-            with self._services.held(request, "a map is compared with the calibration (service update_calibration)"):
+            with ExitStack() as stack:
+                purpose = "a map is compared with the calibration (service update_calibration)"
+                try:
+                    stack.enter_context(self._services.held(request, purpose))
+                except Refusal as refusal:  # a map of a mirror that somebody moves is not usable, and shows nothing
+                    if not (request.dry_run and refusal.error_code == ErrorCode.BUSY):
+                        raise
                 # A map of a mirror that does not rest before and after is refused: corrections of creep wait so long.
                 _becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
