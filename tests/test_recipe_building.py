@@ -13,7 +13,6 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import Recipe, RecipeError
-from dm_controller.converge.goals import UnreachableError, recipe_targets
 from dm_controller.converge.recipe_building import (
     BuildOptions,
     BuildStep,
@@ -22,7 +21,7 @@ from dm_controller.converge.recipe_building import (
 )
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.recipes import Corrections
+from dm_controller.planning.recipes import Corrections, UnreachableError, recipe_targets
 from dm_controller.planning.target import FocusTarget
 from linear_plant import LIMITS, MODEL, LinearPlant
 from studies.comparison.compare import true_error

@@ -9,11 +9,10 @@ from dm_calibration.procedure.applied_history import SettledState
 from dm_common.hysteresis.creep_record import CreepRecord, record_of
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
-from dm_controller.converge.goals import UnreachableError
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
-from dm_controller.planning.recipes import Corrections
+from dm_controller.planning.recipes import Corrections, UnreachableError
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
 

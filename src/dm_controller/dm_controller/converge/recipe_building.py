@@ -18,10 +18,9 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Bench
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
 from dm_controller.converge.defects import Defects, mean_of
-from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import Corrections
+from dm_controller.planning.recipes import Corrections, UnreachableError
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag
 

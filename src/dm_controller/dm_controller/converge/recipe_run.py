@@ -21,9 +21,9 @@ from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import without_figures
-from dm_controller.converge.goals import recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
+from dm_controller.planning.recipes import recipe_targets
 from dm_controller.planning.target import FocusTarget
 
 #: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.

@@ -100,8 +100,14 @@ class Solver(ABC):
             ValueError: signals or a shape of other size than the model's, or not finite.
         """
         self._check(error)
-        self._check_signals(signals)
-        return self.limited(self._signals(signals, -error))
+        count = self.model.influence_zernike.shape[1]
+        if signals.shape != (count,) or not np.isfinite(signals).all():
+            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
+        return self.limited(self._corrected(signals, error))
+
+    def _corrected(self, signals: Floats, error: Shape) -> Floats:
+        """Better signals (N,), inside the limits or not."""
+        return self._signals(signals, -error)
 
     @abstractmethod
     def _signals(self, start: Floats, change: Shape) -> Floats:
@@ -120,11 +126,6 @@ class Solver(ABC):
                 raise ValueError(
                     f"{name} of shape {value.shape}: must be {size} finite numbers, as many as the calibration has"
                 )
-
-    def _check_signals(self, signals: Floats) -> None:
-        count = self.model.influence_zernike.shape[1]
-        if signals.shape != (count,) or not np.isfinite(signals).all():
-            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
 
     def limited(self, signals: Floats) -> Command:
         """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""

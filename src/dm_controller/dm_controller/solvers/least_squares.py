@@ -9,7 +9,7 @@ from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
-from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, normalised_terms, points_of
+from dm_controller.solvers.base import Floats, Shape, Solver, miss_rows, normalised_terms, points_of
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3
@@ -52,7 +52,7 @@ class AZreg(PseudoInverse):
     source = "Eq. (6), least squares on the 21 coefficients"
 
 
-class IterativeLearning(Solver):
+class IterativeLearning(PseudoInverse):
     """s_{k+1} = s_k + L e_k, L = (GᵀG + β)⁻¹Gᵀ (iterative learning control, references 12 and 13 of [1]).
 
     [1] names the method, its about three iterations and what β does ("by decreasing β, we increase the convergence
@@ -68,13 +68,8 @@ class IterativeLearning(Solver):
         if not (np.isfinite(beta) and beta > 0.0):
             raise ValueError(f"beta = {beta:g}: must be above 0 and finite; 0.001 is the default")
         super().__init__(model, limits)
-        matrix, self._factors = normalised_terms(model)
-        left, singular, right = np.linalg.svd(matrix, full_matrices=False)
-        self._learning = (right.T * (singular / (singular**2 + beta * singular[0] ** 2))) @ left.T
-
-    def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._learning @ (self._factors * change.coefficients[PISTON_TILT:])
-        return start + step
+        left, singular, right = np.linalg.svd(normalised_terms(model)[0], full_matrices=False)
+        self._inverse = (right.T * (singular / (singular**2 + beta * singular[0] ** 2))) @ left.T
 
 
 class AZWreg(Solver):
@@ -114,11 +109,10 @@ class AZWreg(Solver):
         step: Floats = self._inverse @ self._reduce(change.sag)
         return start + step
 
-    def correct(self, signals: Floats, error: Shape) -> Command:
-        """As in the base class, with moves priced by what the actuators miss of them."""
-        self._check(error)
-        self._check_signals(signals)
-        return self.limited(signals - self._correction @ self._reduce(error.sag))
+    def _corrected(self, signals: Floats, error: Shape) -> Floats:
+        """With moves priced by what the actuators miss of them."""
+        better: Floats = signals - self._correction @ self._reduce(error.sag)
+        return better
 
 
 class Bounded(Solver):
@@ -144,9 +138,7 @@ class Bounded(Solver):
         mirror = self._mirror
         return mirror.solve(mirror.matrix @ start + mirror.rows(change))
 
-    def correct(self, signals: Floats, error: Shape) -> Command:
-        """As in the base class, with moves priced by what the actuators miss of them."""
-        self._check(error)
-        self._check_signals(signals)
+    def _corrected(self, signals: Floats, error: Shape) -> Floats:
+        """With moves priced by what the actuators miss of them."""
         wanted = self._mirror.matrix @ signals - self._mirror.rows(error)
-        return self.limited(self._correction.solve(np.concatenate([wanted, self._miss @ signals])))
+        return self._correction.solve(np.concatenate([wanted, self._miss @ signals]))
