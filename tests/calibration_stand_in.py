@@ -147,10 +147,10 @@ class StandIn:
         sag = self.plant.sag(self.signals) + bump * self.plant.modes[:, 4]
         zernike, samples = response.zernike, response.samples
         response.info.header.stamp = zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
-        zernike.radius = samples.radius = RADIUS
+        zernike.radius = RADIUS
         zernike.wavelength = 632.8e-9
         zernike.coefficients = doubles(self.plant.fit_terms(sag))
-        zernike.residual_rms, zernike.valid_fraction = 3e-9, 0.97
+        zernike.residual_rms, response.info.valid_fraction = 3e-9, 0.97
         samples.x, samples.y = doubles(self.plant.points.x), doubles(self.plant.points.y)
         samples.weight, samples.sag = doubles(self.plant.points.weight), doubles(sag)
         return response

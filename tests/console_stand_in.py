@@ -89,10 +89,8 @@ def calibration(actuators: int, radius: float = RADIUS) -> Calibration:
     return Calibration(
         id="c19",
         actuators=actuators,
-        terms=21,
-        points=300,
         aperture_radius=radius,
-        quality=Calibration.CALIBRATED,
+        quality=Capabilities.CALIBRATED,
         influence_zernike=array("d", influence.ravel()),
         zernike_offset=array("d", np.zeros(21)),
         sample_x=array("d", points.x),

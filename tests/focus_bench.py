@@ -20,6 +20,7 @@ from dm_msgs.msg import (
     FocusState,
     MirrorInfo,
 )
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
@@ -48,23 +49,19 @@ def calibration(serial: str = "T-1", radius: float = RADIUS, **fields: Any) -> C
     message = Calibration(
         id="known",
         mirror_serial=serial,
-        method="exact",
         aperture_radius=radius,
         actuators=37,
-        terms=21,
         influence_zernike=MIRROR.fit_terms(MIRROR.influence.T).T.ravel().tolist(),
         zernike_offset=MIRROR.figure_coefficients.tolist(),
-        points=len(points),
         sample_x=points.x.tolist(),
         sample_y=points.y.tolist(),
         sample_weight=points.weight.tolist(),
         influence_sag=MIRROR.influence.ravel().tolist(),
         sag_offset=(MIRROR.modes @ MIRROR.figure_coefficients).tolist(),
-        in_sample_rms=1e-10,
         held_out_rms=2e-10,
         held_out_max_zernike=3e-10,
         maps_used=100,
-        quality=Calibration.CALIBRATED,
+        quality=Capabilities.CALIBRATED,
     )
     for name, value in fields.items():
         setattr(message, name, value)
@@ -79,6 +76,7 @@ class Bench:
         node = observer.node
         self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
         self.calibration = node.create_publisher(Calibration, "calibration", qos.LATCHED)
+        self.recipes = node.create_publisher(RecipeBookMsg, "recipes", qos.LATCHED)
         self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
         self.request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.commands: list[ActuatorCommand] = []
@@ -143,10 +141,8 @@ def hysteresis_message(law: HysteresisModel) -> ActuatorHysteresis:
         play_weight=doubles(law.play_weight),
         creep_rate=law.creep_rate,
         creep_time=doubles(law.creep_time),
-        zernike_sigma=[3e-10] * 21,
         held_out_max_zernike=1e-9,
         unknown_sigma=0.05,
-        maps=300,
     )
 
 
@@ -154,10 +150,14 @@ def recipe(curvature: float, effective: NDArray[np.float64]) -> Recipe:
     return Recipe(curvature, 0.0, effective, effective, max_zernike=5e-10, rms=2e-9, maps=4)
 
 
-def calibration_with_history(law: HysteresisModel, recipes: tuple[Recipe, ...] = (), **fields: Any) -> Calibration:
-    """With the law of hysteresis `law`, and `recipes` that begin with a degauss of 60 half-swings."""
-    book = recipe_book_message(RecipeBook(recipes, 60, 1e-10, 0))
-    return calibration(hysteresis=hysteresis_message(law), recipes=book, **fields)
+def recipe_book(*recipes: Recipe) -> RecipeBookMsg:
+    """Of the calibration here; recipes that begin with a degauss of 60 half-swings."""
+    return recipe_book_message(RecipeBook(recipes, 60, 1e-10, 0), "known")
+
+
+def calibration_with_history(law: HysteresisModel, **fields: Any) -> Calibration:
+    """With the law of hysteresis `law`."""
+    return calibration(hysteresis=hysteresis_message(law), **fields)
 
 
 class HysteresisBench(Bench):

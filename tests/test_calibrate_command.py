@@ -148,7 +148,7 @@ class FakeClient:
             (3.2e-9, {**left, "maps_left": 39}),
             (1.9e-9, {}),
         ):
-            show(Calibrate.Feedback(phase=Calibrate.Feedback.PHASE_HYSTERESIS, reached_max_zernike=reached, **rest))
+            show(Calibrate.Feedback(phase="hysteresis", reached_max_zernike=reached, **rest))
         return Calibrate.Result(id="c1", maps=130, message="2 nm is reached: 1.9 nm", hysteresis_model="Preisach")
 
 

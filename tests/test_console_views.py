@@ -83,7 +83,7 @@ def map_of_terms(coefficients: np.ndarray, pixels: int = 300) -> tuple[np.ndarra
 
 def test_cells_carry_signal_limit_and_grade() -> None:
     message, _ = calibration()
-    message.actuator_grade = bytes([Calibration.GRADE_DEAD, *[Calibration.GRADE_GOOD] * (COUNT - 1)])
+    message.actuator_grade = ["dead", *["good"] * (COUNT - 1)]
     shape = state([0.0, 1.0, -0.5, 0.0, 0.0, 0.0, 0.0])
     shape.flags = bytes([0, ActuatorState.FLAG_AT_LIMIT, ActuatorState.FLAG_REFUSED, 0, 0, 0, 0])
     first, second, third, *_ = view_models.cells(mirror_info(), shape, message)
@@ -292,9 +292,9 @@ def test_a_measured_way_comes_back_and_stays_inside() -> None:
 
 def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
     message, _ = calibration()
-    influence = np.array(message.influence_sag).reshape(message.points, COUNT)
+    influence = np.array(message.influence_sag).reshape(-1, COUNT)
     x, y = np.array(message.sample_x), np.array(message.sample_y)
-    before = SimpleNamespace(x=x, y=y, sag=np.zeros(message.points))
+    before = SimpleNamespace(x=x, y=y, sag=np.zeros(len(influence)))
     after = SimpleNamespace(x=x, y=y, sag=0.37 * influence[:, 2] + 1e-6 + 3e-7 * x - 2e-7 * y)
     after.sag[5] = np.nan
     assert effective_change(before, after, message, 3) == pytest.approx(0.37)

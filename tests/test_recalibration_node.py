@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.msg import Capabilities
 from dm_msgs.srv import HoldMirror, LoadCalibration, UpdateCalibration
 
 from calibration_stand_in import StandIn
@@ -127,8 +128,6 @@ def test_update_by_service_is_stored_published_and_forgotten(suite: Suite, begin
     assert 0.0 < taken.gain_drift < 0.01
     suite.expect(2)
     assert suite.calibration.checked.sec > 0
-    assert suite.calibration.gain_drift == taken.gain_drift
-    assert suite.calibration.offset_drift == taken.offset_drift
     stored = CalibrationStore(suite.folder).load("steady")
     assert not np.array_equal(stored.fit.influence_sag.ravel(), np.array(suite.calibration.influence_sag))
     again = suite.observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration="steady"))
@@ -154,7 +153,7 @@ def test_updates_outlive_the_node(suite: Suite, begin: Callable[..., Suite]) -> 
     assert suite.process.stop() == 0
     later = begin()
     later.expect(2)
-    assert later.calibration.gain_drift == taken.gain_drift > 0.0
+    assert later.call(dry_run=True).gain_drift == taken.gain_drift > 0.0
 
 
 def test_maps_that_the_interferometer_publishes_are_taken_once(suite: Suite) -> None:
@@ -200,7 +199,7 @@ def test_it_goes_on_without_an_actuator_that_died(suite: Suite) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and "Goes on without actuator 7 (stands at " in done.stdout, done.stdout + done.stderr
     suite.expect(1)
-    assert suite.calibration.actuator_grade[6] == CalibrationMsg.GRADE_DEAD
+    assert suite.calibration.actuator_grade[6] == "dead"
     assert any("Goes on without actuator 7" in sentence for sentence in suite.calibration.known_limitations)
     suite.shape()
     assert suite.call().accepted
@@ -268,8 +267,8 @@ def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
         suite.bench.publish_map(suite.bench.map(bump=100e-9))
         told = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
         wait_until(told, 60)
-    assert quality == CalibrationMsg.CALIBRATED
-    wait_until(lambda: suite.calibration.quality == CalibrationMsg.APPROXIMATE, 60)
+    assert quality == Capabilities.CALIBRATED
+    wait_until(lambda: suite.calibration.quality == Capabilities.APPROXIMATE, 60)
     assert suite.calibration.known_limitations[-1].startswith("The last 3 maps disagree with this calibration")
     assert np.array_equal(np.array(suite.calibration.influence_sag), before)
     status = suite.status("the mirror has changed, calibrate again")

@@ -88,7 +88,7 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Sta
     assert [step.curvature for step in feedback] == sorted(step.curvature for step in feedback)
     assert {(step.curvature, step.recipes) for step in feedback} == {(-0.01, 0), (0.02, 1)}
     (request,) = store.requests
-    assert request.calibration_id == "known"
+    assert request.recipes.calibration_id == "known"
     book = recipe_book_from(request.recipes)
     assert book.degauss_steps == 100
     assert set(bench.degauss_steps) == {100}

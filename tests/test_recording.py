@@ -40,7 +40,7 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
-from dm_common.messages import doubles, time_message
+from dm_common.messages import doubles, taken, time_message
 from dm_common.ros import qos
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagError, BagReader, BagWriter, Message, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
@@ -112,13 +112,16 @@ def session_messages(run: RecordedRun) -> list[tuple[str, Any]]:
             coefficients=doubles(measured.coefficients),
             sigma=doubles(measured.sigma),
             residual_rms=measured.residual_rms,
-            valid_fraction=measured.valid_fraction,
         )
         points = measured.points
         samples = SurfaceSamples(
             x=doubles(points.x), y=doubles(points.y), weight=doubles(points.weight), sag=doubles(measured.sag)
         )
-        info = SurfaceMapInfo(system_error_subtracted=-1, file=measured.file, sha256=measured.sha256)
+        info = SurfaceMapInfo(
+            system_error_subtracted=-1,
+            valid_fraction=measured.valid_fraction,
+            **taken(measured, "file", "sha256"),
+        )
         named = {"/surface_map_info": info, "/zernike": zernike, "/surface_samples": samples}
         for message in named.values():
             message.header.stamp = time_message(measured.stamp_ns)

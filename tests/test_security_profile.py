@@ -7,9 +7,11 @@ from pathlib import Path
 from xml.etree import ElementTree as xml
 
 import pytest
+from dm_msgs.msg import RecipeBook
 from typer.testing import CliRunner
 
 from dm_client import DeformableMirrorClient
+from dm_common.ros import qos
 from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
 from dm_tools.console.console_node import ConsoleNode
@@ -50,6 +52,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
             wait_until(lambda: client.node.count_publishers("surface_map"), 60.0)
             client.measure_map()  # its subscriptions are made when they are needed
             hear_health(client)  # as `dm status` and `dm check` do
+            client.hear("recipes", RecipeBook, qos.LATCHED)  # as `dm recipes` does
             yield client
         finally:
             side.close()

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Calibrate
-from dm_msgs.msg import Calibration, ErrorCode
+from dm_msgs.msg import ErrorCode
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from dm_msgs.srv import StoreRecipes
 
 from calibration_stand_in import StandIn
@@ -30,23 +31,21 @@ def test_recipes_are_stored_and_published_again(
 ) -> None:
     mirror = make_mirror(rings=1)
     bench = StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9))
-    received = observer.record(Calibration, "calibration", qos.LATCHED)
+    received = observer.record(RecipeBookMsg, "recipes", qos.LATCHED)
     parameters = {"calibration_folder": str(tmp_path / "c"), "settle_time": 0.01, "write_report": False}
     node = start("dm_calibration", "calibration", parameters)
     wait_until(lambda: received, 60, node.output)
     bench.publish_info(mirror)
 
     def store(calibration_id: str, actuators: int) -> Any:
-        recipes = recipe_book_message(book(actuators))
-        return observer.call(
-            StoreRecipes, "store_recipes", StoreRecipes.Request(calibration_id=calibration_id, recipes=recipes)
-        )
+        recipes = recipe_book_message(book(actuators), calibration_id)
+        return observer.call(StoreRecipes, "store_recipes", StoreRecipes.Request(recipes=recipes))
 
     assert store("x", mirror.actuators).error_code == ErrorCode.NOT_CALIBRATED
     goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True)
     made = observer.run_goal(Calibrate, "calibrate", goal, 60).result
     assert made.error_code == ErrorCode.OK, made.message
-    wait_until(lambda: received[-1].id == made.id, 60)
+    wait_until(lambda: received[-1].calibration_id == made.id, 60)
 
     refused = store("another", mirror.actuators)
     assert refused.error_code == ErrorCode.CALIBRATION_MISMATCH
@@ -56,7 +55,7 @@ def test_recipes_are_stored_and_published_again(
 
     answer = store(made.id, mirror.actuators)
     assert answer.error_code == ErrorCode.OK, answer.message
-    wait_until(lambda: received[-1].recipes.recipes, 60)
-    for stored in (recipe_book_from(received[-1].recipes), CalibrationStore(tmp_path / "c").load(made.id).recipes):
+    wait_until(lambda: received[-1].recipes, 60)
+    for stored in (recipe_book_from(received[-1]), CalibrationStore(tmp_path / "c").load(made.id).recipes):
         assert stored.degauss_steps == 100
         np.testing.assert_array_equal(stored.recipes[0].effective, book(mirror.actuators).recipes[0].effective)

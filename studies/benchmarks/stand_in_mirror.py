@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from dm_msgs.msg import Calibration, MirrorInfo
+from dm_msgs.msg import Calibration, Capabilities, MirrorInfo
 
 from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
@@ -130,22 +130,18 @@ def calibration(name: str, serial: str = SERIAL) -> Calibration:
     return Calibration(
         id=SERIAL,
         mirror_serial=serial,
-        method="analytic plate",
         aperture_radius=model.aperture_radius,
         actuators=37,
-        terms=len(TERMS),
         influence_zernike=doubles(model.influence_zernike.ravel()),
         zernike_offset=doubles(model.zernike_offset),
-        points=len(model.sample_x),
         sample_x=doubles(model.sample_x),
         sample_y=doubles(model.sample_y),
         sample_weight=doubles(model.sample_weight),
         influence_sag=doubles(model.influence_sag.ravel()),
         sag_offset=doubles(model.sag_offset),
-        in_sample_rms=model.held_out_rms,
         held_out_rms=model.held_out_rms,
         held_out_max_zernike=model.held_out_max_zernike,
         maps_used=MAPS,
-        quality=Calibration.CALIBRATED,
+        quality=Capabilities.CALIBRATED,
         hysteresis=hysteresis_message(hysteresis),
     )

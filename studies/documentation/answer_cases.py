@@ -238,11 +238,11 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "store_recipes": (
         srv.StoreRecipes,
         (
-            "calibration_id: IN_USE",
-            "calibration_id: LONG",
-            f"calibration_id: nonsense, recipes: {{degauss_steps: 100, recipes: [{{{_RECIPE}}}]}}",
+            "recipes: {calibration_id: IN_USE}",
+            "recipes: {calibration_id: LONG}",
+            f"recipes: {{calibration_id: nonsense, degauss_steps: 100, recipes: [{{{_RECIPE}}}]}}",
             *(
-                f"calibration_id: IN_USE, recipes: {{degauss_steps: 100, recipes: [{{{recipe}}}]}}"
+                f"recipes: {{calibration_id: IN_USE, degauss_steps: 100, recipes: [{{{recipe}}}]}}"
                 for recipe in (
                     f"curvature: .nan, {_RECIPE}",
                     f"conic_constant: .inf, {_RECIPE}",
@@ -256,9 +256,9 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
                     f"rms: .nan, {_RECIPE}",
                 )
             ),
-            f"calibration_id: IN_USE, recipes: {{degauss_steps: 0, recipes: [{{{_RECIPE}}}]}}",
-            "calibration_id: IN_USE, recipes: {degauss_steps: 100, interpolation_error: .nan}",
-            "calibration_id: IN_USE, recipes: {stamp: {sec: 1}, degauss_steps: 100, interpolation_error: 1.0e-9, "
+            f"recipes: {{calibration_id: IN_USE, degauss_steps: 0, recipes: [{{{_RECIPE}}}]}}",
+            "recipes: {calibration_id: IN_USE, degauss_steps: 100, interpolation_error: .nan}",
+            "recipes: {calibration_id: IN_USE, stamp: {sec: 1}, degauss_steps: 100, interpolation_error: 1.0e-9, "
             f"recipes: [{{curvature: 0.03, conic_constant: -1.0, maps: 4, {_RECIPE}}}]}}",
         ),
     ),

@@ -26,10 +26,7 @@ STANDARD = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces")
 STANDARD_TOPICS = ("rosout", "parameter_events")
 GRAPH_S = 20.0
 PART_TITLES = {"msg": ("",), "srv": ("request", "response"), "action": ("goal", "result", "feedback")}
-#: Lines of a screen, and the interfaces that are shown on more.
-SCREEN = 50
-LONG = ("Calibrate", "Calibration", "IngestFile", "Measure", "MoveFocus")
-HEAD = f"""# Interfaces
+HEAD = """# Interfaces
 
 Written from the code by `./dm exec python -m studies.documentation.interfaces`; a test keeps it true. Parameters are
 on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
@@ -49,8 +46,6 @@ A program asks by the topic `focus_request` or the service `set_focus` (`dry_run
 and `degauss` go below the controller; `calibrate`, `converge` and `build_recipes` are actions with an interferometer,
 `autofocus`, `focus_stack` and `set_focus_distance` with a camera. Every refusal carries an `error_code` and a sentence
 with the value and the allowed range.
-
-`ros2 interface show` fills more than a screen of {SCREEN} lines for {", ".join(LONG)}; `--no-comments` shortens it.
 
 ## Nodes
 

@@ -49,7 +49,7 @@ BENCH: dict[str, tuple[Any, tuple[str, ...]]] = {
 TOPICS: dict[str, tuple[Any, str, str]] = {
     "image_raw": (Image, "encoding: rgb9, width: 4, height: 4", "autofocus"),
     "temperature": (Temperature, "temperature: 500.0", "calibration"),
-    "zernike": (msg.ZernikeCoefficients, "convention: 7", "calibration"),
+    "zernike": (msg.ZernikeCoefficients, "convention: seven", "calibration"),
     "calibration": (msg.Calibration, "id: another, actuators: 37", "focus_controller"),
     "surface_samples": (msg.SurfaceSamples, "sag: [1.0]", "calibration"),
     "mirror_info": (msg.MirrorInfo, "actuators: 37", "calibration"),

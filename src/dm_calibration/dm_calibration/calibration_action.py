@@ -30,11 +30,11 @@ from dm_common.values import without_figures
 FEEDBACK_PERIOD_S = 0.1
 
 _PHASES = {
-    StepKind.DEGAUSS: Calibrate.Feedback.PHASE_DEGAUSS,
-    StepKind.POKE: Calibrate.Feedback.PHASE_POKES,
-    StepKind.SURFACE: Calibrate.Feedback.PHASE_SURFACES,
-    StepKind.EXCITATION: Calibrate.Feedback.PHASE_HYSTERESIS,
-    StepKind.CHECK: Calibrate.Feedback.PHASE_HYSTERESIS,
+    StepKind.DEGAUSS: "degauss",
+    StepKind.POKE: "pokes",
+    StepKind.SURFACE: "surfaces",
+    StepKind.EXCITATION: "hysteresis",
+    StepKind.CHECK: "hysteresis",
 }
 
 #: How long a goal waits for a driver that was started together with this node.
@@ -126,7 +126,7 @@ class CalibrateAction:
         try:
             if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
                 procedure.run()
-            self._report(Calibrate.Feedback.PHASE_FIT, "fit", len(self._plan.steps))
+            self._report("fit", "fit", len(self._plan.steps))
             self._conclude(run, runs, enough)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
@@ -193,7 +193,7 @@ class CalibrateAction:
             )
         self._services.check_history()
 
-    def _report(self, phase: int, label: str, step: int) -> None:
+    def _report(self, phase: str, label: str, step: int) -> None:
         feedback = self._feedback
         feedback.phase, feedback.label, feedback.step = phase, label, step
         left = step_times(self._plan.steps[step : self._end], self._services.settle_time, self._services.map_time)
@@ -249,7 +249,7 @@ class CalibrateAction:
             return
         if (found := calibration.hysteresis) is not None:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = found.name, found.held_out_max_zernike
-        self._report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(self._plan.steps))
+        self._report("store", calibration.id, len(self._plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
         result.file = str(self._manager.keep(calibration))
         run.journal.remove()

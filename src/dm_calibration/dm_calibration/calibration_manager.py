@@ -147,7 +147,7 @@ class CalibrationManager:
         if calibration.id != calibration_id:
             raise Refusal(
                 ErrorCode.CALIBRATION_MISMATCH,
-                f"calibration_id = {calibration_id!r}: the calibration in use is {calibration.id!r}",
+                f"recipes.calibration_id = {calibration_id!r}: the calibration in use is {calibration.id!r}",
             )
         return calibration
 

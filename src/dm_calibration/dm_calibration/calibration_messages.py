@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import math
-from array import array
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, RecipeBook, ZernikeCoefficients
+from dm_msgs.msg import ActuatorHysteresis, Capabilities, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.updates import InUse
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.messages import doubles, recipe_book_message, taken, time_message
+from dm_common.messages import doubles, taken, time_message
 
 # Fields of the message that are named as those of a calibration and of its fit.
-_NAMES = (
-    *("id", "mirror_name", "mirror_serial", "software_version", "wavelength", "aperture_radius", "maps_dropped"),
-    *("reference_surface", "instrument_error", "scale_error"),
-)
-_RANGE = ("method", "actuators", "signal_min", "signal_max")
-_FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")
+_NAMES = ("id", "mirror_serial", "wavelength", "aperture_radius", "instrument_error", "scale_error")
+_FIGURES = ("actuators", "held_out_rms", "held_out_max_zernike")
 _MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 #: Arrays of a hysteresis model that the message has under the same names.
 _LAW = (
@@ -54,26 +50,22 @@ def calibration_message(
     fit, points = calibration.fit, calibration.fit.points
     message.header.stamp = time_message(calibration.stamp_ns)
     message.file = str(file or "")
-    message.convention = ZernikeCoefficients.BORN_WOLF
-    message.terms = calibration.maps.terms
-    message.points = points.x.size
     message.sample_x = doubles(points.x)
     message.sample_y = doubles(points.y)
     message.sample_weight = doubles(points.weight)
     message.maps_used = int(fit.used.sum())
-    for source, names in ((calibration, _NAMES), (fit, _RANGE), (fit, _FIGURES)):
+    for source, names in ((calibration, _NAMES), (fit, _FIGURES)):
         for name in names:
             setattr(message, name, getattr(source, name))
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
     doubtful = calibration.doubts(calibrated_error_max)
-    message.quality = CalibrationMsg.APPROXIMATE if doubtful else CalibrationMsg.CALIBRATED
+    message.quality = Capabilities.APPROXIMATE if doubtful else Capabilities.CALIBRATED
     message.actuator_grade = _grades(fit)
     message.known_limitations = list(calibration.limitations)
     message.region_weights = doubles(calibration.region_weights)
     if calibration.hysteresis is not None:
         message.hysteresis = hysteresis_message(calibration.hysteresis)
-    message.recipes = recipe_book_message(calibration.recipes)
     return message
 
 
@@ -95,19 +87,15 @@ def put_updates(
         promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, kept.disagreement), warm_error)
     message.revision = drift.revision
     message.checked = time_message(drift.checked_ns)
-    message.gain_drift = abs(drift.largest_gain[0])
-    message.offset_drift = drift.offset_rms
     message.creep_shown = drift.trust
     message.known_limitations = [*message.known_limitations, *doubts]
     message.actuator_grade = _grades(fit)
-    if drift.given_up:
-        message.recipes = RecipeBook()  # of a mirror with all its actuators
     if mirror_changed or drift.given_up:
-        message.quality = CalibrationMsg.APPROXIMATE
+        message.quality = Capabilities.APPROXIMATE
 
 
-def _grades(fit: InfluenceFit) -> array[int]:
-    return array("B", fit.grades.astype(np.uint8).tobytes())
+def _grades(fit: InfluenceFit) -> list[str]:
+    return [GRADE_NAMES[grade] for grade in fit.grades]
 
 
 def _slopes(law: HysteresisModel) -> Floats:
@@ -128,6 +116,5 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
         lags=law.lag_spectrum.shape[-1],
         crept_at=time_message(round(1e9 * law.crept_at)),
         **taken(law, "creep_rate", "creep_slope"),
-        zernike_sigma=doubles(hysteresis.zernike_sigma),
-        **taken(hysteresis, "held_out_max_zernike", "unknown_sigma", "maps"),
+        **taken(hysteresis, "held_out_max_zernike", "unknown_sigma"),
     )

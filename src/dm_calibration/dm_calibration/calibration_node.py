@@ -8,7 +8,7 @@ from typing import Any
 
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.msg import MirrorInfo
+from dm_msgs.msg import MirrorInfo, RecipeBook
 from dm_msgs.srv import (
     FitInfluenceFunction,
     FitRegression,
@@ -31,7 +31,8 @@ from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
-from dm_common.messages import mirror_from, recipe_book_from, time_message
+from dm_common.messages import mirror_from, recipe_book_from, recipe_book_message, time_message
+from dm_common.recipes import NO_RECIPES
 from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.executor import run_node
@@ -53,6 +54,7 @@ class CalibrationNode(ManagedNode):
         self._loaded_by = ""  # what `load_on_start` was when it was carried out last
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
+        self._recipes = self.create_publisher(RecipeBook, "recipes", qos.LATCHED)
         self._reports = ReportWriter(self._log_report, lambda: self._values["calibrated_error_max"])
         self._manager = CalibrationManager(
             CalibrationStore(self._values["calibration_folder"], self._write_report),
@@ -129,6 +131,9 @@ class CalibrationNode(ManagedNode):
         message.aperture_tolerance = float(self._values["aperture_tolerance"])
         self._listener.begin(calibration)
         self._listener.amend(message)
+        # Recipes are of a mirror with all its actuators. First, so that nobody takes the calibration for one without.
+        book = calibration.recipes if calibration and not self._listener.given_up else NO_RECIPES
+        self._recipes.publish(recipe_book_message(book, message.id))
         self._publisher.publish(message)
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
@@ -209,7 +214,7 @@ class CalibrationNode(ManagedNode):
             one_each.check("effective", recipe.effective)
             one_each.check("signals", recipe.signals)
         book = recipe_book_from(request.recipes)
-        calibration = self._manager.add_recipes(request.calibration_id, book)
+        calibration = self._manager.add_recipes(request.recipes.calibration_id, book)
         response.message = (
             f"{len(book.recipes)} recipes stored with calibration {calibration.id}, which now has "
             f"{len(calibration.recipes.recipes)}"

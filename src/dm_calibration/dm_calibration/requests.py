@@ -35,7 +35,7 @@ FIT_REGRESSION = Fields(
 UPDATE_CALIBRATION = Fields({"holder": text("")})
 STORE_RECIPES = Fields(
     {
-        "calibration_id": text(""),
+        "recipes.calibration_id": text(""),
         "recipes.degauss_steps": whole(0, 1, 10_000),
         "recipes.interpolation_error": real(0.0, 0.0, 1.0, "m"),
     }

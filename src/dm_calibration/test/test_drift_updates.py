@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dm_msgs.msg import Capabilities
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
@@ -177,7 +178,7 @@ def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made
         assert error(bench, fit) < 3e-9
         message = calibration_message(in_use(manager).calibration, None, "mirror", 1.0)
         put_updates(message, in_use(manager), np.nan, manager.doubts, False)
-        assert message.quality == message.APPROXIMATE and message.actuator_grade[6] == message.GRADE_DEAD
+        assert message.quality == Capabilities.APPROXIMATE and message.actuator_grade[6] == "dead"
         assert any("Goes on without actuators 7" in sentence for sentence in message.known_limitations)
     for _ in range(2):  # later maps agree, whatever is asked of the two
         wanted = np.random.default_rng(8).uniform(-0.7, 0.7, bench.mirror.actuators)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from dm_msgs.msg import ActuatorEstimate as ActuatorEstimateMsg
-from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo
 from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
@@ -84,7 +84,9 @@ def mirror_from(message: MirrorInfo) -> Mirror:
 
 #: Fields of Measurement that dm_msgs/SurfaceMapInfo and dm_msgs/ZernikeCoefficients have under the same names.
 OF_FILE = ("reference_surface", "instrument_error", "scale_error", "instrument", "pitch", "system_error_subtracted")
-OF_FIT = ("residual_rms", "valid_fraction", "radius", "wavelength")
+OF_FIT = ("residual_rms", "radius", "wavelength")
+#: Order and normalisation of coefficients here, by its name in dm_msgs/ZernikeCoefficients.
+BORN_WOLF = "born_wolf"
 
 
 def measurement_from(response: Any) -> Measurement:
@@ -98,8 +100,8 @@ def measurement_from(response: Any) -> Measurement:
     from dm_common.optics.sampling import SamplePoints
 
     zernike, samples, info = response.zernike, response.samples, response.info
-    if zernike.convention != ZernikeCoefficients.BORN_WOLF:
-        raise ValueError(f"zernike.convention = {zernike.convention}: must be {ZernikeCoefficients.BORN_WOLF}")
+    if zernike.convention not in ("", BORN_WOLF):
+        raise ValueError(f"zernike.convention = {zernike.convention!r}: must be {BORN_WOLF}")
     if not len(samples.sag) == len(samples.x) == len(samples.y) == len(samples.weight) > 0:
         raise ValueError(f"samples: {len(samples.sag)} sag values at {len(samples.x)} points")
     coefficients = np.array(zernike.coefficients, dtype=np.float64)
@@ -111,7 +113,7 @@ def measurement_from(response: Any) -> Measurement:
         sigma=sigma if sigma.shape == coefficients.shape else np.full(coefficients.shape, np.nan),
         stamp_ns=stamp_ns(zernike.header.stamp),
         **taken(zernike, *OF_FIT),
-        **taken(info, "file", "sha256", *OF_FILE),
+        **taken(info, "file", "sha256", "valid_fraction", *OF_FILE),
         camera=(info.width, info.height),
         centre=(info.centre_x, info.centre_y),
         followed=(info.followed_x, info.followed_y),
@@ -241,14 +243,15 @@ _ARRAYS, _NUMBERS = (
 )
 
 
-def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:
-    """Recipes as a message."""
+def recipe_book_message(book: RecipeBook, calibration_id: str) -> RecipeBookMsg:
+    """Recipes of a calibration as a message."""
     recipes = [
         RecipeMsg(**vars(recipe) | {name: doubles(np.array(getattr(recipe, name))) for name in _ARRAYS})
         for recipe in book.recipes
     ]
     return RecipeBookMsg(
         stamp=time_message(book.stamp_ns),
+        calibration_id=calibration_id,
         degauss_steps=book.degauss_steps,
         interpolation_error=book.interpolation_error,
         recipes=recipes,

@@ -164,7 +164,7 @@ class MoveFocusAction:
         # Goals that wait for their turn may get it in another order than they came in.
         if self._to_stop(handle):
             return self._stopped(handle, None)
-        handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
+        handle.publish_feedback(MoveFocus.Feedback(phase="planning"))
         node.await_start()
         if goal.tolerance > 0.0:
             preview = node.state(node.order(goal.request, dry_run=True))
@@ -181,7 +181,7 @@ class MoveFocusAction:
         result.state = node.answer(order)
         if ended is not None:
             return ended
-        handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
+        handle.publish_feedback(MoveFocus.Feedback(phase="settling", progress=1.0))
         if not sleep(node.get_clock(), goal.settle_time or self._settle_time(), lambda: self._to_stop(handle)):
             return self._stopped(handle, order)
         with node.controller() as (controller, _now):
@@ -204,7 +204,7 @@ class MoveFocusAction:
                 return self._stopped(handle, order)
             if time.monotonic() >= next_feedback:
                 next_feedback = time.monotonic() + FEEDBACK_S
-                phase = MoveFocus.Feedback.PHASE_PLAN if progress.planning else MoveFocus.Feedback.PHASE_MOVE
+                phase = "planning" if progress.planning else "moving"
                 handle.publish_feedback(
                     MoveFocus.Feedback(phase=phase, progress=progress.share, remaining=progress.remaining)
                 )

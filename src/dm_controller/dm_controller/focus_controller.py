@@ -73,13 +73,15 @@ class FocusController:
 
     # --- what is known ---
 
-    def use(self, calibration: Any, mirror: Any) -> list[Effect]:
-        """Use a dm_msgs/Calibration if it belongs to the dm_msgs/MirrorInfo, None = not known; else refuse requests."""
+    def use(self, calibration: Any, mirror: Any, recipes: Any = None) -> list[Effect]:
+        """Use a dm_msgs/Calibration, with its dm_msgs/RecipeBook, if it belongs to the dm_msgs/MirrorInfo, None = not
+        known; else refuse requests. Recipes of another calibration do not count.
+        """
         effects: list[Effect] = []
         before = self.active
-        settings = [self._values[name] for name in ("hold_tilt", "optical_axis")]
+        hold_tilt, axis = self._values["hold_tilt"], self._values["optical_axis"]
         try:
-            active = active_calibration(calibration, mirror, *settings)
+            active = active_calibration(calibration, mirror, hold_tilt, axis, recipes)
             # A new revision leaves the shape that stands as it is: so it can be held on.
             if before is None or before.calibration.id != active.calibration.id:
                 self.hold.end("another calibration is used")
@@ -89,7 +91,7 @@ class FocusController:
             active.note_creep_shown(before, self.observer.state)
             self.active, self._at_rest = active, None
             effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
-            if self._values["hold_tilt"] and active.mirror.tilt is None:
+            if hold_tilt and active.mirror.tilt is None:
                 effects.append(Log("warning", f"calibration {active.calibration.id}: {NO_TILT}"))
         except Refusal as refusal:
             self.active, self.not_calibrated = None, refusal

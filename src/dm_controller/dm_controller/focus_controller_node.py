@@ -19,6 +19,7 @@ from dm_msgs.msg import (
     FocusRequest,
     FocusState,
     MirrorInfo,
+    RecipeBook,
 )
 from rclpy.clock import Clock, ClockType
 
@@ -63,6 +64,7 @@ class FocusControllerNode(FocusHost):
         values = self._values
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
+        self._recipes = RecipeBook()
         self._command = self.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.with_lease(qos.LATCHED))
@@ -81,6 +83,7 @@ class FocusControllerNode(FocusHost):
         self._driver = qos.watch(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
+        self.create_subscription(RecipeBook, "recipes", self._on_recipes, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self.order, qos.COMMAND)
         if not values["autostart"]:
@@ -94,7 +97,7 @@ class FocusControllerNode(FocusHost):
         """Use the calibration with the mirror, as far as both are known."""
         if self.active:
             with self.controller() as (controller, now):
-                self.carry_out(controller.use(self._calibration, self._mirror), now)
+                self.carry_out(controller.use(self._calibration, self._mirror, self._recipes), now)
                 self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
     @contextmanager
@@ -119,6 +122,13 @@ class FocusControllerNode(FocusHost):
     def _on_calibration(self, message: Calibration) -> None:
         self._calibration = message
         self.activate()
+
+    def _on_recipes(self, message: RecipeBook) -> None:
+        before, self._recipes = self._recipes, message
+        # Each message on `calibration` comes with one, which mostly brings nothing new.
+        new = message != before and (message.recipes or before.recipes)
+        if new and self._calibration is not None and message.calibration_id == self._calibration.id:
+            self.activate()
 
     def _on_parameters(self, changes: Mapping[str, Any]) -> None:
         if {"hold_tilt", "optical_axis"} & set(changes):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorEstimate, Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
@@ -160,7 +160,7 @@ def capabilities_message(
     sentences = [empty or f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
-    dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == Calibration.GRADE_DEAD]
+    dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == "dead"]
     if dead:
         sentences.append(f"without actuator{'s' if len(dead) > 1 else ''} {', '.join(dead)}")
     if stale := active.stale(now.ns, values["calibration_age_max"]):

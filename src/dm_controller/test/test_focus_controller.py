@@ -87,8 +87,6 @@ def calibration(name: str = "known", law: HysteresisModel = LAW, **fields: Any) 
         id=name,
         mirror_serial="M1",
         actuators=ACTUATORS,
-        terms=21,
-        points=POINTS,
         aperture_radius=RADIUS,
         influence_zernike=doubles(np.linalg.lstsq(terms, influence, rcond=None)[0]),
         zernike_offset=doubles(np.zeros(21)),
@@ -106,7 +104,6 @@ def calibration(name: str = "known", law: HysteresisModel = LAW, **fields: Any) 
             powers=1,
             creep_rate=law.creep_rate,
             creep_time=doubles(law.creep_time),
-            zernike_sigma=doubles(np.full(21, 3e-10)),
             held_out_max_zernike=1e-9,
             unknown_sigma=0.05,
         ),
@@ -286,7 +283,7 @@ def test_a_calibration_without_tilt_is_named_where_tilt_is_to_be_held(removed: b
 
 def test_it_goes_on_without_an_actuator_that_does_not_move_and_says_so(bench: Bench) -> None:
     whole = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
-    without = calibration("without", actuator_grade=[0] * 5 + [Calibration.GRADE_DEAD] + [0] * 31)
+    without = calibration("without", actuator_grade=["good"] * 5 + ["dead"] + ["good"] * 31)
     moves = np.arange(ACTUATORS) != 5
     for name in ("influence_zernike", "influence_sag"):
         matrix = np.array(getattr(without, name)).reshape(-1, ACTUATORS)
@@ -646,9 +643,8 @@ def test_a_degauss_that_fails_ends_the_order(
 def test_a_recipe_follows_its_degauss(bench: Bench) -> None:
     effective = np.random.default_rng(3).uniform(-0.4, 0.4, ACTUATORS)
     recipe = Recipe(curvature=0.01, effective=doubles(effective), signals=doubles(effective), max_zernike=5e-10)
-    bench.do(
-        bench.controller.use(calibration("recipes", recipes=RecipeBook(degauss_steps=60, recipes=[recipe])), MIRROR)
-    )
+    book = RecipeBook(calibration_id="recipes", degauss_steps=60, recipes=[recipe])
+    bench.do(bench.controller.use(calibration("recipes"), MIRROR, book))
     bench.ask(0.01, mode=CONDITIONED)
     assert bench.degauss_runs[-1].steps == 60
     bench.degauss()

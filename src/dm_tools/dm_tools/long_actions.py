@@ -24,8 +24,6 @@ LONG = ("build_recipes", "calibrate", "converge")
 RUNNING = (1, 2, 3)
 #: A goal that says nothing for so long has lost its node, s. Nodes wait 60 s for a map.
 SILENCE_S = 150.0
-#: Phases of the action `calibrate`, by their number.
-PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
 
 
 def warning_in(result: Any) -> str:
@@ -115,8 +113,7 @@ class ExternalGoals:
 
 def calibration_step(feedback: Any) -> str:
     """Feedback of the action `calibrate`: phase, what is measured, what was dropped, how good it is so far."""
-    phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
-    text = phase if feedback.label in ("", phase) else f"{phase} {feedback.label}"
+    text = feedback.phase if feedback.label in ("", feedback.phase) else f"{feedback.phase} {feedback.label}".strip()
     if feedback.maps_dropped:
         text += f", {feedback.maps_dropped} dropped"
     return ", ".join(filter(None, (text, reached_so_far(feedback))))

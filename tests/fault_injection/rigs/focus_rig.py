@@ -23,8 +23,8 @@ from dm_msgs.msg import (
     FocusRequest,
     FocusState,
     MirrorInfo,
-    ZernikeCoefficients,
 )
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from dm_msgs.srv import Flatten, Measure, SetFocus
 from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
@@ -110,6 +110,7 @@ class FocusRig(DriverRig):
         WorkerService(node, Measure, "measure", self._on_measure)
         self._model = stand_in_mirror.influence_model()
         self._publisher_of_calibration: Any = None
+        self._publisher_of_recipes = node.create_publisher(RecipeBookMsg, "recipes", qos.LATCHED)
         self.start_controller()
         self.wait(lambda: self._infos, "mirror_info")
         self.calibrate()
@@ -145,12 +146,8 @@ class FocusRig(DriverRig):
         del self.capabilities[:-100]
 
     def calibration(self, **fields: Any) -> Calibration:
-        """A calibration with memory and recipes of the mirror that the driver announces."""
-        mirror = CalibratedMirror(self._model, limits_from(self._infos[-1]))
-        plans = {c: mirror.plan(FocusTarget(c)).signals for c in np.linspace(-1.2 * REACH, 1.2 * REACH, 5).tolist()}
-        recipes = tuple(Recipe(c, 0.0, signals, signals, 1e-9, 1e-9, 3) for c, signals in plans.items())
+        """A calibration with memory."""
         message = stand_in_mirror.calibration(LAW, SERIAL)
-        message.recipes = recipe_book_message(RecipeBook(recipes, DEGAUSS_STEPS, 1e-9, 0))
         message.header.stamp = self.node.get_clock().now().to_msg()
         for name, value in fields.items():
             setattr(message, name, value)
@@ -168,8 +165,14 @@ class FocusRig(DriverRig):
         self._publisher_of_calibration = None
 
     def calibrate(self) -> None:
-        """Have the controller take a calibration."""
-        self.publish_calibration(self.calibration())
+        """Have the controller take a calibration, and recipes of the mirror that the driver announces."""
+        message = self.calibration()
+        mirror = CalibratedMirror(self._model, limits_from(self._infos[-1]))
+        plans = {c: mirror.plan(FocusTarget(c)).signals for c in np.linspace(-1.2 * REACH, 1.2 * REACH, 5).tolist()}
+        recipes = tuple(Recipe(c, 0.0, signals, signals, 1e-9, 1e-9, 3) for c, signals in plans.items())
+        book = RecipeBook(recipes, DEGAUSS_STEPS, 1e-9, 0)
+        self._publisher_of_recipes.publish(recipe_book_message(book, message.id))
+        self.publish_calibration(message)
         self.wait(
             lambda: self.capabilities and self.capabilities[-1].quality == Capabilities.CALIBRATED,
             "the controller's calibration",
@@ -178,10 +181,9 @@ class FocusRig(DriverRig):
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         model, signals = self._model, GAIN * self.signals
         coefficients = model.zernike_offset + model.influence_zernike @ signals
-        response.zernike.convention = ZernikeCoefficients.BORN_WOLF
         response.zernike.coefficients = doubles(coefficients)
         response.zernike.radius = model.aperture_radius
-        response.zernike.valid_fraction = 1.0
+        response.info.valid_fraction = 1.0
         samples = response.samples
         samples.x, samples.y, samples.weight = (
             doubles(values) for values in (model.sample_x, model.sample_y, model.sample_weight)

@@ -13,7 +13,7 @@ from dm_calibration.acquisition.sensor import PIXELS, Seen, disc_terms
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.measurement import Measurement
-from dm_common.messages import OF_FILE, OF_FIT, doubles, taken
+from dm_common.messages import BORN_WOLF, OF_FILE, OF_FIT, doubles, taken
 from dm_common.optics.zernike import TERMS, ansi_to_born_wolf, fringe_to_born_wolf, noll_to_born_wolf
 
 
@@ -23,11 +23,11 @@ def _born_wolf(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     return coefficients
 
 
-_TO_BORN_WOLF: dict[int, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    ZernikeCoefficients.BORN_WOLF: _born_wolf,
-    ZernikeCoefficients.NOLL: noll_to_born_wolf,
-    ZernikeCoefficients.ANSI: ansi_to_born_wolf,
-    ZernikeCoefficients.FRINGE: fringe_to_born_wolf,
+_TO_BORN_WOLF: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    BORN_WOLF: _born_wolf,
+    "noll": noll_to_born_wolf,
+    "ansi": ansi_to_born_wolf,
+    "fringe": fringe_to_born_wolf,
 }
 
 
@@ -53,7 +53,7 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
         followed_y=measured.followed[1],
         aperture_radius_px=measured.radius_px,
         aperture_radius=measured.radius,
-        **taken(measured, "wavelength", "valid_fraction", *OF_FILE),
+        **taken(measured, "valid_fraction", *OF_FILE),
         **taken(surface, "pv", "rms", "piston_tilt_removed", "file", "sha256"),
         flip_x=measured.orientation[0],
         flip_y=measured.orientation[1],
@@ -62,13 +62,10 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
 
 
 def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficients:
-    """The Zernike fit, with the aperture's centre in m from the map's, y up; zeros without a pitch."""
-    (width, height), (x, y) = measured.camera, measured.centre
+    """The Zernike fit."""
     return ZernikeCoefficients(
         header=header,
-        convention=ZernikeCoefficients.BORN_WOLF,
-        centre_x=(x - (width - 1) / 2) * measured.pitch,
-        centre_y=((height - 1) / 2 - y) * measured.pitch,
+        convention=BORN_WOLF,
         coefficients=doubles(measured.coefficients),
         sigma=doubles(measured.sigma),
         **taken(measured, *OF_FIT),
@@ -82,11 +79,12 @@ def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
         MapRejectedError: an unknown convention, too few terms, or values that are not finite.
     """
     radius, wavelength = message.radius, message.wavelength
-    if message.convention not in _TO_BORN_WOLF:
-        known = sorted(_TO_BORN_WOLF)
-        raise MapRejectedError(f"{source}: convention = {message.convention}: must be one of {known}")
+    convert = _TO_BORN_WOLF.get(message.convention or BORN_WOLF)
+    if convert is None:
+        known = ", ".join(_TO_BORN_WOLF)
+        raise MapRejectedError(f"{source}: convention = {message.convention!r}: must be one of {known}")
     try:
-        coefficients = _TO_BORN_WOLF[message.convention](np.array(message.coefficients, dtype=np.float64))
+        coefficients = convert(np.array(message.coefficients, dtype=np.float64))
     except ValueError as error:
         raise MapRejectedError(f"{source}: {error}") from error
     if not np.isfinite([*coefficients, radius, wavelength]).all():
@@ -101,7 +99,6 @@ def samples_message(measured: Measurement, header: Header) -> SurfaceSamples:
     points = measured.points
     return SurfaceSamples(
         header=header,
-        radius=measured.radius,
         x=doubles(points.x),
         y=doubles(points.y),
         weight=doubles(points.weight),

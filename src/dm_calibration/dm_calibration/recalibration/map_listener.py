@@ -115,6 +115,11 @@ class MapListener:
             self._published_at, self._dirty = time.monotonic(), False
             put_updates(message, kept, temperature, self._doubts(), self._updates.mirror_changed)
 
+    @property
+    def given_up(self) -> bool:
+        """Whether the calibration in use goes on without some actuators."""
+        return (kept := self._updates.in_use) is not None and bool(kept.drift.given_up)
+
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
         doubts = self._updates.doubts

@@ -97,7 +97,7 @@ class RecipeRun:
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
             book = recipe_book(recipes, planner, steps, round(1e9 * bench.now()), active.recipes)
             result.interpolation_error = book.interpolation_error
-            request = StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
+            request = StoreRecipes.Request(recipes=recipe_book_message(book, calibration.id))
             stored, reason = self._stored(handle, request)
             if stored == ErrorCode.OK:
                 result.recipes = len(recipes)

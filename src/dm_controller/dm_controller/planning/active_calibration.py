@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.msg import Calibration, MirrorInfo
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
@@ -15,7 +16,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
-from dm_common.recipes import RecipeBook
+from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections
@@ -111,8 +112,11 @@ def active_calibration(
     mirror: MirrorInfo | None,
     hold_tilt: bool = True,
     axis: Sequence[float] = (0.0, 0.0),
+    recipes: RecipeBookMsg | None = None,
 ) -> ActiveCalibration:
     """What to plan moves of `mirror` with; `hold_tilt` and `axis`: see `CalibratedMirror`.
+
+    `recipes` of another calibration do not count.
 
     Raises:
         Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
@@ -138,8 +142,9 @@ def active_calibration(
         limits = limits_from(mirror)
         model = model_of(calibration, np.asarray(mirror.actuator_x), np.asarray(mirror.actuator_y))
         calibrated = CalibratedMirror(model, limits, hold_tilt, axis)
-        recipes = recipe_book_from(calibration.recipes)
-        if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
+        own = recipes is not None and recipes.calibration_id == calibration.id
+        book = recipe_book_from(recipes) if own else NO_RECIPES
+        if any(len(recipe.effective) != calibration.actuators for recipe in book.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         certain = calibrated
@@ -149,7 +154,7 @@ def active_calibration(
             certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
-    return ActiveCalibration(calibration, calibrated, certain, planner, recipes)
+    return ActiveCalibration(calibration, calibrated, certain, planner, book)
 
 
 def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Floats | None = None) -> InfluenceModel:
@@ -157,7 +162,7 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
 
     Raises ValueError when its arrays do not fit together.
     """
-    actuators, terms, points = calibration.actuators, calibration.terms, calibration.points
+    actuators = calibration.actuators
 
     def matrix(name: str, rows: int) -> Floats:
         values = np.asarray(getattr(calibration, name), dtype=float)
@@ -167,12 +172,12 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
 
     return InfluenceModel(
         aperture_radius=calibration.aperture_radius,
-        influence_zernike=matrix("influence_zernike", terms),
+        influence_zernike=matrix("influence_zernike", len(calibration.zernike_offset)),
         zernike_offset=np.asarray(calibration.zernike_offset, dtype=float),
         sample_x=np.asarray(calibration.sample_x, dtype=float),
         sample_y=np.asarray(calibration.sample_y, dtype=float),
         sample_weight=np.asarray(calibration.sample_weight, dtype=float),
-        influence_sag=matrix("influence_sag", points),
+        influence_sag=matrix("influence_sag", len(calibration.sag_offset)),
         sag_offset=np.asarray(calibration.sag_offset, dtype=float),
         held_out_rms=calibration.held_out_rms,
         held_out_max_zernike=calibration.held_out_max_zernike,
@@ -211,9 +216,6 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         raise ValueError(
             f"hysteresis: play_weight: effective signals span {furthest:.3g}, must be {SPAN:g}: a law of another scale"
         )
-    sigma = np.array(hysteresis.zernike_sigma, dtype=np.float64)
-    if sigma.shape != (calibration.terms,) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():
-        raise ValueError(f"hysteresis: zernike_sigma: must be {calibration.terms} finite numbers, none negative")
     for name in ("held_out_max_zernike", "unknown_sigma"):
         value = getattr(hysteresis, name)
         if not (np.isfinite(value) and value >= 0.0):

@@ -11,7 +11,7 @@ from typing import Any
 
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.msg import ActuatorEstimate, SurfaceMapInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorEstimate, RecipeBook, SurfaceMapInfo, ZernikeCoefficients
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
@@ -26,6 +26,7 @@ from dm_tools.long_actions import LONG, ExternalGoals
 
 TOPICS = client.TOPICS | {
     "actuator_estimate": (ActuatorEstimate, qos.LATCHED),
+    "recipes": (RecipeBook, qos.LATCHED),
     "surface_map": (Image, qos.MAP),
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
     "zernike": (ZernikeCoefficients, qos.STATE),
@@ -60,6 +61,7 @@ class Snapshot:
 
     mirror_info: Any = None
     calibration: Any = None
+    recipes: Any = None
     capabilities: Any = None
     actuator_state: Any = None
     actuator_estimate: Any = None

@@ -75,7 +75,7 @@ def effective_change(before: Any, after: Any, calibration: Any, actuator: int) -
     Raises:
         ValueError: the maps were sampled at other points, or the actuator does nothing to the surface.
     """
-    points, count = calibration.points, calibration.actuators
+    points, count = len(calibration.sample_x), calibration.actuators
     x, y = np.array(after.x), np.array(after.y)
     if x.shape != (points,) or not np.allclose(x, calibration.sample_x) or not np.allclose(y, calibration.sample_y):
         raise ValueError(f"the map was sampled at {x.size} points, not at the {points} of the calibration")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from dm_msgs.msg import ActuatorState, Calibration
+from dm_msgs.msg import ActuatorState, Capabilities
 
 from dm_common.figures import in_nanometres
 from dm_tools.console.view_models import QUALITIES
@@ -58,7 +58,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
     else:
         quality = QUALITIES.get(calibration.quality, "?")
         shown.append(
-            Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Calibration.CALIBRATED else "doubt")
+            Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Capabilities.CALIBRATED else "doubt")
         )
         if calibration.hysteresis.play_radius:
             shown.append(Badge("history: not known", "doubt") if doubt else Badge("history: known"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
+from dm_msgs.msg import ActuatorState, Capabilities, FocusRequest
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
@@ -21,14 +21,9 @@ SIGMAS_95 = 1.96
 NUMBER_MAX = 1000
 SIGNAL_COLOURS = "cividis"
 QUALITIES = {
-    Calibration.UNCALIBRATED: "uncalibrated",
-    Calibration.APPROXIMATE: "approximate",
-    Calibration.CALIBRATED: "calibrated",
-}
-GRADES = {
-    Calibration.GRADE_WEAK: "weak",
-    Calibration.GRADE_DEAD: "dead",
-    Calibration.GRADE_NOT_EXCITED: "never moved by the calibration",
+    Capabilities.UNCALIBRATED: "uncalibrated",
+    Capabilities.APPROXIMATE: "approximate",
+    Capabilities.CALIBRATED: "calibrated",
 }
 MODES = {
     FocusRequest.MODE_AUTO: "Automatic",
@@ -87,7 +82,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
 
     applied = one_each(state.applied if state is not None else (), None)
     flags = one_each(bytes(state.flags) if state is not None else b"", 0)
-    grades = one_each(calibration.actuator_grade if calibration is not None else (), Calibration.GRADE_GOOD)
+    grades = one_each(calibration.actuator_grade if calibration is not None else (), "good")
     found = []
     for index, (signal, flag, grade) in enumerate(zip(applied, flags, grades, strict=True)):
         fill = "#e4e7eb"
@@ -109,7 +104,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
     return found
 
 
-def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tuple[str, str]]:
+def _marks(flags: int, grade: str, signal: float | None, mirror: Any) -> list[tuple[str, str]]:
     """(sign, text), the most important first."""
     middle = 0.5 * (mirror.signal_min + mirror.signal_max)
     marks = []
@@ -121,8 +116,8 @@ def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tu
         marks.append(("▲", "at its upper limit") if signal > middle else ("▼", "at its lower limit"))
     if flags & ActuatorState.FLAG_RAMPING:
         marks.append(("…", "on its way"))
-    if grade in GRADES:
-        marks.append(("?", f"graded {GRADES[grade]}"))
+    if grade != "good":
+        marks.append(("?", f"graded {grade}"))
     return marks
 
 
@@ -249,10 +244,9 @@ def calibration_text(calibration: Any) -> list[str]:
     if calibration is None:
         return ["No calibration is in use."]
     lines = [
-        f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}, method {calibration.method}, "
-        f"{calibration.maps_used} maps, {calibration.maps_dropped} dropped.",
-        f"Residual {calibration.in_sample_rms * NM:.2f} nm rms in-sample, {calibration.held_out_rms * NM:.2f} nm held "
-        f"out; largest held-out coefficient error {calibration.held_out_max_zernike * NM:.2f} nm.",
+        f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}, {calibration.maps_used} maps.",
+        f"Held out: {calibration.held_out_rms * NM:.2f} nm rms, largest coefficient error "
+        f"{calibration.held_out_max_zernike * NM:.2f} nm.",
     ]
     law = calibration.hysteresis
     if law.play_radius:
@@ -260,8 +254,6 @@ def calibration_text(calibration: Any) -> list[str]:
             f"Hysteresis: {law.law}; creep {law.creep_rate:.2%} per decade; held-out "
             f"moves to {law.held_out_max_zernike * NM:.2f} nm."
         )
-    if calibration.recipes.recipes:
-        lines.append(f"Conditioned recipes: {len(calibration.recipes.recipes)}.")
     if calibration.revision:
         lines.append(f"Maps that updated it since: {calibration.revision}.")
     return lines

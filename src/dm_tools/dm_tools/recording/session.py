@@ -42,7 +42,6 @@ COMPARED = (
     "hysteresis.duhem_weight",
     "hysteresis.fading_weight",
     "hysteresis.creep_rate",
-    "hysteresis.zernike_sigma",
 )
 
 

@@ -73,7 +73,7 @@ _DECLARED = (
     ),
     NodeInterface(
         "calibration",
-        publish=("calibration",),
+        publish=("calibration", "recipes"),
         subscribe=("actuator_state", "mirror_info", "surface_map_info", "surface_samples", "temperature", "zernike"),
         reply=(
             *("fit_influence_function", "fit_regression", "list_calibrations", "load_calibration"),
@@ -88,7 +88,7 @@ _DECLARED = (
     NodeInterface(
         "focus_controller",
         publish=("actuator_command", "actuator_estimate", "capabilities", "focus_state"),
-        subscribe=("actuator_state", "calibration", "focus_request", "mirror_info", "surface_map_info"),
+        subscribe=("actuator_state", "calibration", "focus_request", "mirror_info", "recipes", "surface_map_info"),
         reply=("flatten", "set_focus"),
         request=("hold_mirror", "measure", "predict_error", "set_signals", "store_recipes"),
         execute=("build_recipes", "converge", "move_focus"),
@@ -109,7 +109,7 @@ _DECLARED = (
         "dm_console_*",
         subscribe=(
             *(HEALTH, "/rosout", "actuator_estimate", "actuator_state", "calibration", "capabilities"),
-            *("mirror_info", "surface_map", "surface_map_info", "zernike"),
+            *("mirror_info", "recipes", "surface_map", "surface_map_info", "zernike"),
         ),
         request=_OPERATION,
         call=_LONG_OPERATION,
@@ -119,7 +119,7 @@ _DECLARED = (
         "dm_client_*",
         subscribe=(
             *(HEALTH, "actuator_state", "calibration", "capabilities"),
-            *("mirror_info", "surface_map", "surface_map_info"),
+            *("mirror_info", "recipes", "surface_map", "surface_map_info"),
         ),
         request=(*_OPERATION, "ingest_file", "update_calibration"),
         call=_LONG_OPERATION,

@@ -84,7 +84,10 @@ def recipes(
     Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
     at mid range.
     """
+    from dm_msgs.msg import RecipeBook
+
     from dm_common.recipes import shape_text, terms_of
+    from dm_common.ros import qos
 
     try:
         shapes = [terms_of(text) for text in zernike or ()] or [[]]
@@ -94,19 +97,20 @@ def recipes(
     terms = [term for _ in wanted for shape in shapes for term in shape]
     wanted = [curvature for curvature in wanted for _ in shapes]
     with running_suite(namespace) as client, naming_holder(client):
+        client.hear("recipes", RecipeBook, qos.LATCHED)
         if not show:
             result = _build(
                 client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
             )
             console.print(result.message)
-            client.wait(lambda: len(client.latest("calibration").recipes.recipes) >= result.recipes)
-        calibration = client.latest("calibration")
-    for recipe in calibration.recipes.recipes:
+            client.wait(lambda: len(client.latest("recipes").recipes) >= result.recipes)
+        book = client.latest("recipes")
+    for recipe in book.recipes:
         console.print(
             f"{shape_text(recipe)}, conic constant {recipe.conic_constant:g}: largest coefficient error "
             f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
         )
-    if not calibration.recipes.recipes:
-        console.print(f"calibration {calibration.id or '(none)'} holds no recipes")
-    write_json(json, {"calibration": calibration.id, **_figures(calibration.recipes)})
+    if not book.recipes:
+        console.print(f"calibration {book.calibration_id or '(none)'} holds no recipes")
+    write_json(json, {"calibration": book.calibration_id, **_figures(book)})
     next_step("./dm focus CURVATURE: with a time budget the controller uses a recipe where it does better")

@@ -91,7 +91,7 @@ def _calibration(calibration: Any) -> str:
     if calibration is None or not calibration.id:
         return "not heard" if calibration is None else "none in use"
     age = time.time() - calibration.header.stamp.sec
-    doubtful = sum(grade != 0 for grade in calibration.actuator_grade)
+    doubtful = sum(grade != "good" for grade in calibration.actuator_grade)
     law = f"law {calibration.hysteresis.law}" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
     return (
         f"{calibration.id}: {calibration.maps_used} maps {ago(age)} ago, {law}; "

@@ -150,10 +150,9 @@ class RecipesCard:
         reason = reason_against("converge", snapshot, self._session.running)
         self._build.allow(reason)
         self._reason.show(f"Not possible now: {reason}" if reason else "")
-        calibration = snapshot.calibration
-        rows = [recipe_row(recipe) for recipe in calibration.recipes.recipes] if calibration is not None else []
+        rows = [recipe_row(recipe) for recipe in snapshot.recipes.recipes] if snapshot.recipes is not None else []
         self._table.set_visibility(bool(rows))
-        none = "This calibration holds none." if calibration is not None else "No calibration is in use."
+        none = "This calibration holds none." if snapshot.calibration is not None else "No calibration is in use."
         self._text.show(
             "A recipe is a command that was corrected on the interferometer from the conditioned mirror; the mode "
             f"“Conditioned” uses them. {'' if rows else none}"

@@ -83,7 +83,7 @@ class FocusCard:
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
         """Calibration, recipes, whether the history is known, and what runs: at its end the mirror may have moved."""
         identity = snapshot.capabilities.calibration_id if snapshot.capabilities is not None else ""
-        recipes = len(snapshot.calibration.recipes.recipes) if snapshot.calibration is not None else 0
+        recipes = len(snapshot.recipes.recipes) if snapshot.recipes is not None else 0
         known = snapshot.actuator_state is not None and snapshot.actuator_state.history_known
         return identity, recipes, known, self._session.running
 
