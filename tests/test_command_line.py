@@ -146,10 +146,16 @@ def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("error", "code"), [(NotRunningError("none"), 3), (ValueError("[no] markup"), 1), (KeyboardInterrupt(), 130)]
+    ("error", "code", "said"),
+    [
+        (NotRunningError("none"), 3, "error: none"),
+        (ValueError("[no] markup"), 1, "error: [no] markup"),
+        (DeformableMirrorError(ErrorCode.BUSY, "held"), 1, "error: BUSY: held"),
+        (KeyboardInterrupt(), 130, "error: interrupted"),
+    ],
 )
 def test_exit_codes(
-    error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: BaseException, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(*_words: Any, **_keywords: Any) -> None:
         raise error
@@ -158,7 +164,7 @@ def test_exit_codes(
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == code
-    assert str(error) in capsys.readouterr().err
+    assert capsys.readouterr().err == f"{said}\n"
 
 
 def test_with_nothing_running_the_way_out_is_named_at_once(

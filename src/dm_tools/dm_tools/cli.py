@@ -14,6 +14,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import typer
 from typer.core import TyperCommand
 
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import with_point
 from dm_tools.output import NotRunningError, fail
 
@@ -156,7 +157,9 @@ def run(words: list[str], name: str) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # `./dm` keeps it back while modules are imported
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
-        fail(str(error))
+        # As dm_msgs/ErrorCode calls it, for who looks it up or searches a log for it.
+        code = f"{ErrorCode(error.error_code).name}: " if isinstance(error, CodedError) else ""
+        fail(f"{code}{error}")
         sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)
     except KeyboardInterrupt:
         fail("interrupted")
