@@ -86,7 +86,7 @@ class CalibrateAction:
         if result.error_code == ErrorCode.OK:
             self._node.get_logger().info(f"{result.id or 'poke check'}: {result.message}")
             return "succeed", result
-        self._node.get_logger().warning(f"calibration ended with code {result.error_code}: {result.message}")
+        self._node.get_logger().warning(f"calibration ended with {ErrorCode(result.error_code).name}: {result.message}")
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
 
     def _make_plan(self) -> None:
