@@ -113,7 +113,6 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
         powers=law.play_weight.shape[-1],
         duhem_slope=doubles(_slopes(law)),
         duhem_weight=doubles(np.atleast_1d(law.duhem_weight)),
-        lags=law.lag_spectrum.shape[-1],
         crept_at=time_message(round(1e9 * law.crept_at)),
         **taken(law, "creep_rate", "creep_slope"),
         **taken(hysteresis, "held_out_max_zernike", "unknown_sigma"),

@@ -163,6 +163,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     duhem_slope = np.array(message.duhem_slope, dtype=np.float64)
     if duhem_weight.size > 1 and duhem_slope.size % (2 * duhem_weight.size):
         raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {duhem_weight.size} x 2 x A")
+    own, rate = weight.shape[:-2], np.array(message.fading_rate, dtype=np.float64)
     creep_time = np.array(message.creep_time, dtype=np.float64)
     covariance = np.array(message.creep_covariance, dtype=np.float64)
     if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
@@ -180,27 +181,19 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
         covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
-        _of_actuators("lag_spectrum", message.lag_spectrum, message.lags),
+        _rows_of_any_length("lag_spectrum", message.lag_spectrum, *own),
         message.creep_slope,
-        *_linear_fading(message, weight.shape[:-2]),
+        rate,
+        _rows_of_any_length("fading_weight", message.fading_weight, *own, rate.size) if rate.size else np.zeros((0, 0)),
     )
 
 
-def _linear_fading(message: ActuatorHysteresis, actuators: tuple[int, ...]) -> tuple[Floats, Floats]:
-    """Rates (K,) and weights ([N,] K, P) of the linear Duhem operators.
-
-    Raises:
-        ValueError: fading_weight is not of these rates.
-    """
-    rate, weight = (np.array(value, dtype=np.float64) for value in (message.fading_rate, message.fading_weight))
-    if not rate.size:
-        return rate, np.zeros((0, 0))
-    shape = (*actuators, rate.size)
-    if not weight.size or weight.size % math.prod(shape):
-        raise ValueError(
-            f"hysteresis: fading_weight has {weight.size} values, must be {' x '.join(map(str, shape))} x P"
-        )
-    return rate, weight.reshape(*shape, -1)
+def _rows_of_any_length(name: str, values: array[float], *shape: int) -> Floats:
+    """A field that has rows of this shape, of any length; empty = there is none."""
+    field = np.array(values, dtype=np.float64)
+    if field.size % math.prod(shape):
+        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {' x '.join(map(str, shape))} x any")
+    return field.reshape(*shape, -1) if field.size else field
 
 
 #: Fields of HysteresisState that a dm_msgs/ActuatorEstimate has under the same names.

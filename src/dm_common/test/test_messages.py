@@ -104,7 +104,7 @@ def test_hysteresis_that_was_not_identified_and_one_that_makes_no_sense() -> Non
         hysteresis_model_from(ActuatorHysteresis(play_radius=[0.0, 0.5], play_weight=[1.0, 2.0, 3.0], powers=1))
     one = ActuatorHysteresis(play_radius=[0.0], play_weight=[1.0], powers=1, fading_rate=[1.0, 3.0])
     one.fading_weight = [0.1, 0.2, 0.3]
-    with pytest.raises(ValueError, match="fading_weight has 3 values, must be 2 x P"):
+    with pytest.raises(ValueError, match="fading_weight has 3 values, must be 2 x any"):
         hysteresis_model_from(one)
 
 

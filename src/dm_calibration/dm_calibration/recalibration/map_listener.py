@@ -144,8 +144,7 @@ class MapListener:
 
     def tick(self) -> None:
         """Publish what is due; called about once a second by the node."""
-        stale = self._stale
-        kept = self._updates.in_use
+        stale, kept = self._stale, self._updates.in_use
         warmed = kept is not None and kept.drift.thermal_trust > 0.0 and self._temperatures.changed
         if self._dirty or stale != self._was_stale or warmed:
             self._was_stale = stale
@@ -169,11 +168,9 @@ class MapListener:
         if not (self._values["updates.enable"] and self._node.active and self._updates.in_use) or self._busy():
             return
         stamp = stamp_ns(message.header.stamp)
-        parts = self._incomplete.setdefault(stamp, {})
-        parts[name] = message
-        if len(parts) == 3:
-            del self._incomplete[stamp]
-            self._worker.submit(self._on_map, Measure.Response(**parts))
+        self._incomplete.setdefault(stamp, {})[name] = message
+        if len(self._incomplete[stamp]) == 3:
+            self._worker.submit(self._on_map, Measure.Response(**self._incomplete.pop(stamp)))
         while len(self._incomplete) > INCOMPLETE_KEPT:
             del self._incomplete[next(iter(self._incomplete))]
 
@@ -211,14 +208,12 @@ class MapListener:
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
         verdict = self._updates.take(measured, self._history.settled(at, still), dry_run, without)
-        if dry_run:
-            return verdict
-        if verdict.accepted:
-            self._taken += 1
-        else:
-            self._refuse(verdict.reason)
-            self._node.get_logger().warning(f"map not taken: {verdict.reason}")
-        self._changed()
+        if not dry_run:
+            self._taken += verdict.accepted
+            if not verdict.accepted:
+                self._refuse(verdict.reason)
+                self._node.get_logger().warning(f"map not taken: {verdict.reason}")
+            self._changed()
         return verdict
 
     def _refuse(self, reason: str) -> None:
@@ -270,8 +265,7 @@ class MapListener:
                     if not request.dry_run:
                         self._refuse(str(error))
                     raise
-        response.accepted, response.message = verdict.accepted, verdict.reason
-        comparison = verdict.comparison
+        response.accepted, response.message, comparison = verdict.accepted, verdict.reason, verdict.comparison
         response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
         response.surprise = comparison.surprise
 
