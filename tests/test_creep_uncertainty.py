@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.candidate_fit import Run
 from dm_calibration.hysteresis.creep_uncertainty import OWN, SHARED, SHARED_CORRELATION, creep_covariance
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import UNSEEN, record_of, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis import hysteresis_fit
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run, run_of
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -93,7 +94,7 @@ def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() ->
     """Creep of before the run fades as fast in the one as in the other, with a spectrum of each actuator's own too."""
     maps, law = run(), fitted().law
     own = np.exp(0.3 * np.random.default_rng(4).standard_normal((maps.actuators, len(law.creep_time))))
-    effective, law = hysteresis_fit._followed(maps, replace(law, creep_spectrum=own / own.mean()))
+    effective, law = hysteresis_fit._followed(maps, replace(law, creep_spectrum=own / own.mean()), run_of(maps))
     assert np.abs(law.crept).max() > 0.1
     rest, moved = np.zeros(maps.actuators), 1e-9 * maps.moved_ns
     tracker = HysteresisTracker(law)

@@ -11,11 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.law_shape import slope_min
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common import Floats
 from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.law_shape import slope_min, span

@@ -12,11 +12,12 @@ import numpy as np
 from dm_msgs.msg import Calibration, Capabilities, MirrorInfo
 
 from dm_calibration.calibration_messages import hysteresis_message
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common import Floats
 from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
 from dm_common.hysteresis.model import HysteresisModel

@@ -7,8 +7,6 @@ import pytest
 
 from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.features import (
-    creep_blocks,
-    creep_states,
     fading_changes,
     fading_features,
     own_slopes,
@@ -41,27 +39,6 @@ def test_small_changes_of_the_slope_are_found() -> None:
 def test_nothing_is_said_of_an_operator_without_weight() -> None:
     common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
     assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
-
-
-def test_creep_block_by_block_is_that_of_the_whole_run_in_room_that_grows_with_it() -> None:
-    rng = np.random.default_rng(4)
-    time = np.cumsum(rng.uniform(0.5, 20.0, 2000))
-    values = rng.uniform(-1.0, 1.0, (len(time), 3))
-    parts, starts = [slice(0, 150), slice(150, len(time))], [-1.0, float(time[149]) + 0.3]
-    for moved in (None, time - 0.4):
-        at = [None if moved is None else moved[part] for part in parts]
-        whole = [
-            list(creep_states(values[part], time[part], start, when))
-            for part, start, when in zip(parts, starts, at, strict=True)
-        ]
-        blocks = creep_blocks(parts, starts, time, moved)
-        assert sum(block.followed.nbytes for block in blocks) < 2e7  # of the whole matrix, 480 MB
-        state = np.zeros((len(CREEP_TIMES), 3))
-        for block in blocks:
-            state = np.zeros_like(state) if block.stood == block.rows else state
-            followed = block.followed @ values[block.stood] + block.left[:, :, None] * state
-            np.testing.assert_allclose(followed, np.concatenate(whole)[block.rows], atol=1e-12)
-            state = followed[-1]
 
 
 def test_weights_are_those_of_the_normal_equations() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import PREISACH_AND_DUHEM
 from dm_calibration.hysteresis.features import crept, fading_features, play_features, relaxation
-from dm_calibration.hysteresis.segments import without
+from dm_calibration.hysteresis.run import without
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis

@@ -9,17 +9,14 @@ found by Gauss-Newton around that (variable projection [14]).
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dm_calibration.hysteresis.features import CreepBlock, creep_blocks, crept, fading_features, play_features
-from dm_calibration.hysteresis.responses import Responses
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
+from dm_calibration.hysteresis.features import fading_features, play_features
+from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
@@ -94,65 +91,6 @@ COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """The commands and responses of one calibration run, in order, from a degauss at mid range on.
-
-    Attributes:
-        signals: (M, N) as applied.
-        time: (M,) s, of the maps, rising.
-        start: s, when the degauss had ended; None = just before the first map.
-        moved: (M,) s, when the mirror took each shape; None = right after the map before.
-        segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
-    """
-
-    signals: Floats
-    time: Floats
-    responses: Responses
-    start: float | None = None
-    moved: Floats | None = None
-    segment: NDArray[np.int64] | None = None
-
-    def __post_init__(self) -> None:
-        if (np.diff(self.time) < 0.0).any():
-            row = int(np.flatnonzero(np.diff(self.time) < 0.0)[0]) + 1
-            back = self.time[row - 1] - self.time[row]
-            raise ValueError(f"time stamps: map {row + 1} is {back:.3f} s before the map before it; was the clock set?")
-
-    @property
-    def began(self) -> float:
-        return float(self.time[0]) - 1.0 if self.start is None else min(self.start, float(self.time[0]))
-
-    @cached_property
-    def parts(self) -> list[slice]:
-        """Rows of each part of the run, from one degauss to the next."""
-        return parts_of(np.zeros(len(self.time), dtype=np.int64) if self.segment is None else self.segment)
-
-    @cached_property
-    def starts(self) -> list[float]:
-        """When the degauss before each part had ended, s."""
-        return starts_of(self.parts, self.began, self.time, self.moved)
-
-    def in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
-        """What `work` makes of each part and its start, one after the other."""
-        return in_parts(self.parts, self.starts, work)
-
-    def moved_in(self, part: slice) -> Floats | None:
-        """`moved` of the maps of a part."""
-        return None if self.moved is None else self.moved[part]
-
-    @cached_property
-    def creep(self) -> Floats:
-        """(M, M) what creep of an even spectrum adds at each map of what stood at all, per unit of creep rate."""
-        unit = np.eye(len(self.time))
-        return self.in_parts(lambda part, start: crept(unit[part], self.time[part], start, self.moved_in(part)))
-
-    @cached_property
-    def creep_blocks(self) -> list[CreepBlock]:
-        """What the creep elements follow."""
-        return creep_blocks(self.parts, self.starts, self.time, self.moved)
-
-
-@dataclass(frozen=True, eq=False)
 class LawFit:
     """A candidate fitted to some rows of a run.
 
@@ -172,9 +110,8 @@ class CandidateProblem:
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
-        self._plays = run.in_parts(lambda part, start: play_features(run.signals[part], self.radius, candidate.powers))
+        self._plays = run.along(lambda signals: play_features(signals, self.radius, candidate.powers))
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
-        self._figure = figure_columns(run.time, run.parts, run.starts)
         self._scale(scatter)
 
     def _scale(self, scatter: Floats) -> None:
@@ -236,13 +173,13 @@ class CandidateProblem:
         if not self.candidate.slopes:
             return features
         operator = FadingHysteresis(slope)
-        fading = self.run.in_parts(lambda part, start: fading_features(self.run.signals[part], operator))
+        fading = self.run.along(lambda signals: fading_features(signals, operator))
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:
         """Weights (F,), residual (M, D) in units of the scatter."""
-        measured, figure, kept = self._measured[keep], self._figure[keep], features[keep]
+        measured, figure, kept = self._measured[keep], self.run.figure[keep], features[keep]
         if weights is None:
             weights = np.eye(features.shape[1])[0]
         if len(weights) > 1:
@@ -250,7 +187,7 @@ class CandidateProblem:
             weights = _alternate(without(kept, free), without(measured, free), weights)
         design = np.hstack((figure, np.einsum("f,mfn->mn", weights, kept)))
         solution = np.linalg.lstsq(design, measured, rcond=1e-10)[0]
-        design = np.hstack((self._figure, np.einsum("f,mfn->mn", weights, features)))
+        design = np.hstack((self.run.figure, np.einsum("f,mfn->mn", weights, features)))
         return weights, self._measured - design @ solution
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:

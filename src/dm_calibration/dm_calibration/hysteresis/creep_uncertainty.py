@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dm_calibration.hysteresis.candidate_fit import Run
-from dm_calibration.hysteresis.features import creep_states, follow, spectrum_prior
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
+from dm_calibration.hysteresis.features import spectrum_prior
+from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_common import Floats
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT
@@ -35,21 +34,9 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     The first is of errors that all actuators share, the second of those of each by itself.
     """
     values, keep = run.responses.values, run.responses.usable
-    parts, starts = run.parts, run.starts
-    still = replace(law, creep_rate=0.0)
-
-    def features_of(part: slice, start: float) -> Floats:
-        moved = run.moved_in(part)
-        rested = still.demagnetised(run.signals.shape[1], start)
-        position = follow(still, rested, run.signals[part], run.time[part], moved)[0]
-        states = creep_states(position, run.time[part], start, moved)
-        began = law.demagnetised(run.signals.shape[1], start)
-        effective = follow(law, began, run.signals[part], run.time[part], moved)[0]
-        return np.concatenate((position[:, None], np.array(list(states)), effective[:, None]), axis=1)
-
-    features = in_parts(parts, starts, features_of)
-    features, effective = features[:, :-1], features[:, -1]
-    figure = figure_columns(run.time, parts, starts)[keep]
+    position, effective = run.follow(replace(law, creep_rate=0.0)), run.follow(law)
+    features = np.concatenate((position[:, None], run.creep_states(position)), axis=1)
+    figure = run.figure[keep]
     design = np.hstack((figure, effective[keep]))
     solution = np.linalg.lstsq(design, values[keep], rcond=1e-10)[0]
     left = values[keep] - design @ solution

@@ -1,7 +1,6 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
@@ -10,10 +9,9 @@ from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator, FadingHysteresis
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 
-#: Weight of each element of an even creep spectrum per unit of creep rate.
+#: Weight of each element of an even creep spectrum per unit of creep rate, and of all of them.
 PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
-#: Maps whose creep is made at once: room, and work, grow as the maps do, not as their square.
-MAPS_AT_ONCE = 64
+EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
@@ -141,50 +139,25 @@ def creep_states(values: Floats, time: Floats, start: float, moved: Floats | Non
     still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
     state, before = np.zeros((len(CREEP_TIMES), *values.shape[1:])), np.zeros(values.shape[1:])
     for row, now in enumerate(values):
-        state = before + (state - before) * still[2 * row].reshape(shape)
-        state = now + (state - now) * still[2 * row + 1].reshape(shape)
+        state = state - before
+        state *= still[2 * row].reshape(shape)
+        state += before - now
+        state *= still[2 * row + 1].reshape(shape)
+        state += now
         yield state
         before = now
 
 
-class CreepBlock(NamedTuple):
-    """Some maps of a run that follow each other, and what the creep elements have followed by each of them.
+def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None, weight: Floats = EVEN) -> Floats:
+    """What creep adds to features (M, ...); see :func:`creep_states`.
 
-    Attributes:
-        rows: of the run, these maps.
-        stood: of the run, the shapes that stood since the block before: that of its last map, where its part of the run
-            goes on here, and those of `rows`.
-        followed: (B, J, S) of each shape of `stood`.
-        left: (B, J) of what they had followed by the last map of the block before.
+    Args:
+        weight: (J, ...) of the creep elements; of an even spectrum, per unit of creep rate, where not given.
     """
-
-    rows: slice
-    stood: slice
-    followed: Floats
-    left: Floats
-
-
-def creep_blocks(parts: list[slice], starts: list[float], time: Floats, moved: Floats | None) -> list[CreepBlock]:
-    """All maps of a run of such parts, which begin rested at `starts`; arrays as of :func:`creep_states`."""
-    blocks = []
-    for part, start in zip(parts, starts, strict=True):
-        for first in range(part.start, part.stop, MAPS_AT_ONCE):
-            rows, goes_on = slice(first, min(first + MAPS_AT_ONCE, part.stop)), first > part.start
-            stood = slice(first - goes_on, rows.stop)
-            before = float(time[stood.start]) if goes_on else start
-            unit = np.eye(stood.stop - stood.start)
-            states = list(creep_states(unit, time[stood], before, None if moved is None else moved[stood]))
-            left = np.exp((before - time[rows, None]) / CREEP_TIMES)
-            blocks.append(CreepBlock(rows, stood, np.array(states[goes_on:]), left))
-    return blocks
-
-
-def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
-    """What creep of an even spectrum adds to features (M, ...) per unit of creep rate; see :func:`creep_states`."""
     result = np.empty_like(features)
     for row, state in enumerate(creep_states(features, time, start, moved)):
-        result[row] = state.sum(axis=0)
-    return result * PER_ELEMENT
+        result[row] = np.einsum("j...,j...->...", weight, state)
+    return result
 
 
 def weight_of(rate: float) -> float:

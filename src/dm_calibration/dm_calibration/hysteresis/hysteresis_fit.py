@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import largest_of
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
-from dm_calibration.hysteresis.features import follow, weights_of
+from dm_calibration.hysteresis.features import weights_of
 from dm_calibration.hysteresis.identify import Identification, identify
-from dm_calibration.hysteresis.responses import Responses, responses_of
-from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, basis_of, in_parts, parts_of, starts_of, without
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run, basis_of, run_of, without
 from dm_calibration.influence.maps import CHECK, MapSet
 from dm_common import Floats
 from dm_common.hysteresis.inverse import random_histories
@@ -56,13 +56,12 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         TooFewMapsError: no map can be used.
         ValueError: time stamps that run backwards.
     """
-    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
+    run = run_of(maps)
     test = np.array([kind == CHECK for kind in maps.kind])
     found, run = _without_outliers(run, test, candidates)
     covariance = _error_covariance(found, run.responses.coefficients, maps)
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
-    law = _followed(maps, found.fit.law, run.responses)[1]
+    law = _followed(maps, found.fit.law, run)[1]
     if law.creep_rate:
         law = replace(law, creep_covariance=creep_covariance(run, law))
     return HysteresisFit(
@@ -105,41 +104,27 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
     Raises:
         ValueError: time stamps that run backwards.
     """
-    return _followed(maps, law)[0]
+    return _followed(maps, law, run_of(maps))[0]
 
 
-def _followed(maps: MapSet, law: HysteresisModel, responses: Responses | None = None) -> tuple[MapSet, HysteresisModel]:
-    """Maps with effective signals, and the law with what the actuators had crept to before the last part of the run.
+def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, HysteresisModel]:
+    """Maps with effective signals, and the law with what the actuators had crept to before the last part of their run.
 
     Args:
-        responses: of the maps; None = not known yet.
-
-    Raises:
-        ValueError: time stamps that run backwards.
+        run: of the maps; those that contradict a law may not be usable in it.
     """
-    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    moved, parts = maps.moved_s(), parts_of(maps.segment)
-    starts = starts_of(parts, -BEFORE_FIRST_MAP_S, time, moved)
-
-    def followed(part: slice, start: float) -> Floats:
-        state = law.demagnetised(maps.actuators, start)
-        return follow(law, state, maps.applied[part], time[part], moved[part])[0]
-
-    effective = in_parts(parts, starts, followed)
+    effective = run.follow(law)
     if not law.creep_rate:
         return replace(maps, applied=effective), law
-    fading = np.zeros((len(maps), len(parts), maps.actuators))
-    for number, part in enumerate(parts):
-        fading[part, number] = _fading(law, time[part] - starts[number])
-    crept = _crept_before(responses_of(maps) if responses is None else responses, effective, fading)
-    began = 1e-9 * int(maps.stamp_ns[0]) + starts[-1]
+    # How much of an old displacement of each actuator still shows, by the time since it ended.
+    fading = np.zeros((len(maps), len(run.parts), maps.actuators))
+    for number, (rows, start) in enumerate(run.parts):
+        elapsed = run.time[rows, None] - start
+        fading[rows, number] = np.exp(-elapsed / law.creep_time) @ np.atleast_2d(law.creep_share).T
+    crept = _crept_before(run.responses, effective, fading)
+    began = 1e-9 * int(maps.stamp_ns[0]) + run.parts[-1][1]
     effective = effective + np.einsum("msn,sn->mn", fading, crept)
     return replace(maps, applied=effective), replace(law, crept_at=began, crept=crept[-1])
-
-
-def _fading(law: HysteresisModel, elapsed: Floats) -> Floats:
-    """(M, N) or (M, 1) how much of an old displacement of each actuator still shows `elapsed` (M,) s after it ended."""
-    return np.asarray(np.exp(-elapsed[:, None] / law.creep_time) @ np.atleast_2d(law.creep_share).T)
 
 
 def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:

@@ -12,8 +12,9 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
 from dm_calibration.hysteresis.own_laws import OwnLaws
+from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
@@ -95,7 +96,6 @@ def identify(
 
     Raises:
         ExcitationError: the run does not show hysteresis.
-        ValueError: time stamps that run backwards.
     """
     quiet = check_excitation(run)
     usable = run.responses.usable

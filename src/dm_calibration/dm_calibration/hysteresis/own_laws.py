@@ -21,10 +21,9 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
     PER_ELEMENT,
-    creep_states,
     fading_changes,
     fading_features,
     own_slopes,
@@ -35,7 +34,7 @@ from dm_calibration.hysteresis.features import (
     weight_of,
     weights_of,
 )
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, without
+from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
@@ -99,7 +98,7 @@ class OwnLaws:
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
         signals = run.signals
-        values = self.run.in_parts(lambda part, start: play_values(signals[part], self.radius))
+        values = run.along(lambda signals: play_values(signals, self.radius))
         orders = candidate.powers
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
@@ -120,9 +119,8 @@ class OwnLaws:
         lag = LAG**2 * np.exp(-np.abs(np.subtract.outer(number, number)) / SPECTRUM_CORRELATION)
         prior = block_diag(prior_of_creep, lag, CREEP_SLOPE**2)
         self._creep_root = np.asarray(np.linalg.cholesky(prior), dtype=np.float64)
-        self._signal_states = self._creep_states(signals)
+        self._signal_states = self.run.creep_states(signals)
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
-        self._figure = figure_columns(run.time, run.parts, run.starts)
 
     def fit(self, keep: Rows, start: LawFit | None = None, own_fading: bool = True) -> OwnFit:
         """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all.
@@ -142,7 +140,8 @@ class OwnLaws:
             scatter, slope = self._scatter, self._slope
             if slope.size and own_fading:
                 slope = padded_slope(slope, actuators)
-                changing = np.concatenate((self._features(slope), self._fading_changes(slope)), axis=1)
+                changes = self.run.along(lambda signals: fading_changes(signals, slope))
+                changing = np.concatenate((self._features(slope), changes), axis=1)
                 patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
                 own = len(patterns) - 2 * slope.shape[2]
                 slope = own_slopes(slope, patterns[own - 1], patterns[own:])
@@ -158,12 +157,7 @@ class OwnLaws:
 
     def _fading(self, operators: FadingHysteresis) -> Floats:
         """(M, Z, N) values of Duhem operators along the run."""
-        return self.run.in_parts(lambda part, start: fading_features(self.run.signals[part], operators))
-
-    def _fading_changes(self, slope: Floats) -> Floats:
-        """(M, 2 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, A)."""
-        signals = self.run.signals
-        return self.run.in_parts(lambda part, start: fading_changes(signals[part], slope))
+        return self.run.along(lambda signals: fading_features(signals, operators))
 
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
@@ -175,7 +169,7 @@ class OwnLaws:
         sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
         root = np.diag(sigma)
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
-        free = basis_of(self._figure[keep])
+        free = basis_of(self.run.figure[keep])
         crept = self._with_creep(features, creep, patterns)
         gains, residual = self._gains(crept, patterns, keep)
         for number in range(self._rounds_needed):
@@ -218,13 +212,6 @@ class OwnLaws:
             )
         )
 
-    def _creep_states(self, values: Floats) -> Floats:
-        """(M, J, N) what the creep elements have followed of `values` (M, N) at each map."""
-        run = self.run
-        return run.in_parts(
-            lambda part, start: np.array(list(creep_states(values[part], run.time[part], start, run.moved_in(part))))
-        )
-
     def _with_creep(self, features: Floats, creep: Floats, patterns: Floats) -> Floats:
         """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""
         if not creep.any():
@@ -232,32 +219,22 @@ class OwnLaws:
         count = len(CREEP_TIMES)
         loops = creep[:count].copy()
         loops[:LAGS] += creep[count:-1]
-        by_actuator = np.ascontiguousarray(features.transpose(2, 0, 1))
-        added = np.empty_like(features)
-        state = np.zeros((len(by_actuator), count, features.shape[1]))
-        for block in self.run.creep_blocks:
-            stood = by_actuator[:, block.stood]
-            if block.stood == block.rows:  # a part begins, rested
-                state[:] = 0.0
-            followed = np.tensordot(loops.T, block.followed, (1, 1)) @ stood
-            followed += (loops.T[:, None, :] * block.left) @ state
-            added[block.rows] = followed.transpose(1, 2, 0)
-            state = block.left[-1][:, None] * state + block.followed[-1] @ stood
+        added = self.run.crept(features, loops[:, None])
         added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[:count])
         slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
         return features * (1.0 + slope[:, None]) + added
 
     def _gains(self, crept: Floats, patterns: Floats, keep: Rows) -> tuple[Floats, Floats]:
         """Gains (N, D) and residual (M, D), m."""
-        design = np.hstack((self._figure, np.einsum("mfn,fn->mn", crept, patterns)))
+        design = np.hstack((self.run.figure, np.einsum("mfn,fn->mn", crept, patterns)))
         values = self.run.responses.values
         solution = np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0]
-        return solution[self._figure.shape[1] :], values - design @ solution
+        return solution[self.run.figure.shape[1] :], values - design @ solution
 
     def _scatter_of(self, residual: Floats) -> Floats:
         """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
         count = len(residual)
-        freedom = max(count - self._figure.shape[1] - self._plain.shape[2], 1)
+        freedom = max(count - self.run.figure.shape[1] - self._plain.shape[2], 1)
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
         return self.run.responses.scatter(size)
 
@@ -271,7 +248,7 @@ class OwnLaws:
         self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats
     ) -> Floats:
         """(J + L + 1, N) weights of the creep elements, of those that only loops follow, and creep's change."""
-        elements = self._creep_states(position)
+        elements = self.run.creep_states(position)
         lags = elements[:, :LAGS] - self._signal_states[:, :LAGS]
         elements = np.concatenate((elements, lags), axis=1)
         sloped = position * np.einsum("mjn,jn->mn", elements, creep[:-1])

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
-from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S
+from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 
@@ -54,7 +54,9 @@ class ResponseFit:
     def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
         """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to."""
         signals = np.asarray(commands, dtype=np.float64)
-        return np.asarray(self.figure + _effective(self.law, signals, _seconds(times, len(signals))) @ self.influence)
+        rested = self.law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S)
+        effective, _ = follow(self.law, rested, signals, _seconds(times, len(signals)))
+        return np.asarray(self.figure + effective @ self.influence)
 
     def __str__(self) -> str:
         """The laws side by side, the best marked; with the remark, if any."""
@@ -122,7 +124,7 @@ def identify_response(
     error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)
     law = found.fit.law
     middle = seconds - seconds.mean()
-    design = np.column_stack((np.ones(len(signals)), middle / np.ptp(middle), _effective(law, signals, seconds)))
+    design = np.column_stack((np.ones(len(signals)), middle / np.ptp(middle), run.follow(law)))
     solution = np.linalg.lstsq(design[usable], values[usable], rcond=1e-10)[0]
     return ResponseFit(
         name=found.fit.candidate.name,
@@ -148,7 +150,3 @@ def _seconds(times: ArrayLike | None, count: int) -> Floats:
 def _first(rows: NDArray[np.bool_]) -> int:
     """Number of the first of `rows` that is true, from 1."""
     return int(rows.argmax()) + 1
-
-
-def _effective(law: HysteresisModel, signals: Floats, seconds: Floats) -> Floats:
-    return follow(law, law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S), signals, seconds)[0]

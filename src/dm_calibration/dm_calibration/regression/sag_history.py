@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from dm_calibration.hysteresis.features import crept, play_features
-from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of, without
+from dm_calibration.hysteresis.features import play_features
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run, without
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import complete_sag, drift_columns
 from dm_common import Floats
@@ -60,12 +61,10 @@ class RunHistory:
         self._radius = np.array((0.0, *PLAY_RADII))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
-        parts = parts_of(maps.segment)
-        starts = starts_of(parts, float(moved[0]) - BEFORE_FIRST_MAP_S, time, moved)
-        self._plays = in_parts(parts, starts, lambda part, start: play_features(maps.applied[part], self._radius, 1))
-        self._crept = in_parts(
-            parts, starts, lambda part, start: crept(self._plays[part], time[part], start, moved[part])
-        )
+        responses = Responses(self._sag, 0, self._usable)
+        run = Run(maps.applied, time, responses, float(moved[0]) - BEFORE_FIRST_MAP_S, moved, maps.segment)
+        self._plays = run.along(lambda signals: play_features(signals, self._radius, 1))
+        self._crept = run.crept(self._plays)
 
     def fit(self, keep: NDArray[np.bool_]) -> SagModel:
         """The model that explains the maps in `keep` (M,) best."""

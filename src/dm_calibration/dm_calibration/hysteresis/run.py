@@ -1,0 +1,138 @@
+"""The commands of a calibration run and what its maps say, in parts that each begin with a degauss.
+
+What the actuators did between two parts is not known. A degauss wipes their hysteresis; their creep before it fades
+in a pattern that is unknown, as it is before the first part, and the mirror may have drifted meanwhile.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.features import EVEN, creep_states, crept, follow, relaxation
+from dm_calibration.hysteresis.responses import Responses, responses_of
+from dm_calibration.influence.maps import MapSet
+from dm_common import Floats
+from dm_common.hysteresis.model import HysteresisModel
+
+#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
+BEFORE_FIRST_MAP_S = 1.0
+#: A step of the figure is this much more likely than fading creep to explain few maps.
+_FADING_SCALE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The commands and responses of one calibration run, in order, from a degauss at mid range on.
+
+    Attributes:
+        signals: (M, N) as applied.
+        time: (M,) s, of the maps, rising.
+        start: s, when the degauss had ended; None = just before the first map.
+        moved: (M,) s, when the mirror took each shape; None = right after the map before.
+        segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
+
+    signals: Floats
+    time: Floats
+    responses: Responses
+    start: float | None = None
+    moved: Floats | None = None
+    segment: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        if (np.diff(self.time) < 0.0).any():
+            row = int(np.flatnonzero(np.diff(self.time) < 0.0)[0]) + 1
+            back = self.time[row - 1] - self.time[row]
+            raise ValueError(f"time stamps: map {row + 1} is {back:.3f} s before the map before it; was the clock set?")
+
+    @cached_property
+    def parts(self) -> list[tuple[slice, float]]:
+        """Rows of each part of the run, and when the degauss before it had ended, s."""
+        first = float(self.time[0])
+        first = first - BEFORE_FIRST_MAP_S if self.start is None else min(self.start, first)
+        resumed = [] if self.segment is None else (np.flatnonzero(np.diff(self.segment)) + 1).tolist()
+        stood = self.time if self.moved is None else self.moved
+        starts = [first, *(float(stood[row]) - BEFORE_FIRST_MAP_S for row in resumed)]
+        bounds = pairwise((0, *resumed, len(self.time)))
+        return [(slice(*bound), start) for bound, start in zip(bounds, starts, strict=True)]
+
+    def along(self, feature: Callable[[Floats], Floats]) -> Floats:
+        """A `feature` of signals that begin demagnetised, along the commands."""
+        return np.concatenate([feature(self.signals[rows]) for rows, _ in self.parts])
+
+    def follow(self, law: HysteresisModel) -> Floats:
+        """(M, N) effective signals."""
+        followed = []
+        for rows, start in self.parts:
+            rested = law.demagnetised(self.signals.shape[1], start)
+            followed.append(follow(law, rested, self.signals[rows], self.time[rows], self._moved(rows))[0])
+        return np.concatenate(followed)
+
+    def creep_states(self, values: Floats) -> Floats:
+        """(M, J, ...) what the creep elements have followed of `values` (M, ...) at each map."""
+        return np.concatenate(
+            [list(creep_states(values[rows], self.time[rows], start, self._moved(rows))) for rows, start in self.parts]
+        )
+
+    def crept(self, features: Floats, weight: Floats = EVEN) -> Floats:
+        """What creep adds to `features` (M, ...); see :func:`~dm_calibration.hysteresis.features.crept`."""
+        return np.concatenate(
+            [crept(features[rows], self.time[rows], start, self._moved(rows), weight) for rows, start in self.parts]
+        )
+
+    def _moved(self, rows: slice) -> Floats | None:
+        return None if self.moved is None else self.moved[rows]
+
+    @cached_property
+    def creep(self) -> Floats:
+        """(M, M) what creep of an even spectrum adds at each map of what stood at all, per unit of creep rate."""
+        return self.crept(np.eye(len(self.time)))
+
+    @cached_property
+    def figure(self) -> Floats:
+        """(M, 1 + 2 parts) columns of the figure: constant, old creep that fades, drift; a step and fading of each
+        further part.
+        """
+        (rows, start), *resumed = self.parts
+        passed = np.diff(self.time, prepend=self.time[0])
+        passed[[part.start for part, _ in self.parts]] = 0.0
+        running = np.cumsum(passed)
+        fading = np.zeros(len(self.time))
+        fading[rows] = relaxation(self.time[rows], start)
+        drift = (running + self.time[0] - start) / max(float(np.ptp(running)), 1e-9)
+        columns = [np.ones(len(self.time)), fading, drift]
+        for rows, start in resumed:
+            step, fading = np.zeros((2, len(self.time)))
+            step[rows] = 1.0
+            fading[rows] = _FADING_SCALE * relaxation(self.time[rows], start)
+            columns += [step, fading]
+        return np.column_stack(columns)
+
+
+def run_of(maps: MapSet) -> Run:
+    """The maps of one run, in the order measured, which begins with a degauss.
+
+    Raises:
+        TooFewMapsError: no map can be used.
+        ValueError: time stamps that run backwards.
+    """
+    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
+    return Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
+
+
+def basis_of(columns: Floats) -> Floats:
+    """Orthonormal columns that span `columns`, which may be 0 or alike in the rows at hand."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, size > 1e-9 * size[0]])
+
+
+def without(rows: Floats, free: Floats) -> Floats:
+    """`rows` (M, ...) less what the orthonormal columns `free` (M, C) explain."""
+    return rows - np.tensordot(free, np.tensordot(free.T, rows, 1), 1)
