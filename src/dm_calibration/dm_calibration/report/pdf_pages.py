@@ -4,8 +4,9 @@ import io
 from collections.abc import Sequence
 from functools import cache
 from html import escape
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 from reportlab import rl_config
@@ -17,10 +18,10 @@ from reportlab.pdfbase import pdfmetrics
 from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import (
-    CondPageBreak,
     Flowable,
     Image,
     KeepInFrame,
+    KeepTogether,
     LongTable,
     PageBreak,
     Paragraph,
@@ -58,13 +59,6 @@ CAPTION = ParagraphStyle("caption", fontName=REGULAR, fontSize=8, leading=10.5, 
 TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, spaceBefore=6, spaceAfter=3)
 
 
-class Room(NamedTuple):
-    """Flowables and the height (points) that a page must have left for them to begin on it."""
-
-    height: float
-    flowables: list[Flowable]
-
-
 def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
     _register_fonts()
@@ -77,20 +71,15 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     for section in sections:
         style = LEAD if section.sheet else BODY
         text = [_paragraph(section.title, HEADING), *(_paragraph(text, style) for text in section.paragraphs)]
-        shown = [_table(table) for table in section.tables] + [_picture(picture) for picture in section.pictures]
-        if section.sheet:
-            heading = [] if story else [_paragraph(title, TITLE)]
-            parts = [*heading, *text, *(each for _room, flowables in shown for each in flowables)]
-            story += [KeepInFrame(WIDTH, PAGE, parts, mode="shrink"), PageBreak()]
-            continue
         if not story:
             text.insert(0, _paragraph(title, TITLE))
-        # A heading and its text stay with the first table or picture below them, as far as a page has room for all.
-        heights = [each.wrap(WIDTH, HEIGHT)[1] + each.style.spaceBefore + each.style.spaceAfter for each in text]
-        story.append(CondPageBreak(min(sum(heights) + (shown[0][0] if shown else 0.0), PAGE)))
-        story += text
-        for room, flowables in shown:
-            story += [CondPageBreak(min(room, PAGE)), *flowables]
+        shown = [*map(_table, section.tables), *map(_picture, section.pictures)]
+        if section.sheet:
+            story += [KeepInFrame(WIDTH, PAGE, [*text, *chain(*shown)], mode="shrink"), PageBreak()]
+        elif shown:  # on the page of the heading, or from the next one on
+            story += [KeepTogether([*text, *shown[0]]), *map(KeepTogether, shown[1:])]
+        else:
+            story += text
     document.build(story, canvasmaker=_numbered(title))
     return stream.getvalue()
 
@@ -105,16 +94,14 @@ def _paragraph(text: str, style: ParagraphStyle) -> Paragraph:
     return Paragraph(escape(text), style)
 
 
-def _picture(picture: Picture) -> Room:
-    """A picture as wide as the text, or as high as a page, with its caption below it on the same page."""
+def _picture(picture: Picture) -> list[Flowable]:
+    """A picture as wide as the text, or as high as a page, with its caption below it."""
     width, height = (72.0 * length for length in picture.figure.get_size_inches())
     scale = min(WIDTH / width, HEIGHT / height)
-    image = Image(io.BytesIO(picture.png), width * scale, height * scale)
-    caption = _paragraph(picture.caption, CAPTION)
-    return Room(height * scale + caption.wrap(WIDTH, HEIGHT)[1], [image, caption])
+    return [Image(io.BytesIO(picture.png), width * scale, height * scale), _paragraph(picture.caption, CAPTION)]
 
 
-def _table(table: Table) -> Room:
+def _table(table: Table) -> list[Flowable]:
     """A table whose columns are as wide as their longest cell, in a smaller type where they need more than the page."""
     widths = _column_widths(table)
     scale = min(1.0, WIDTH / sum(widths))
@@ -146,10 +133,7 @@ def _table(table: Table) -> Room:
         ]
     )
     made = LongTable(rows, colWidths=[scale * width for width in widths], repeatRows=1, style=style, hAlign="LEFT")
-    # A table that fits on a page is not torn, another begins with a dozen rows at least; its caption stays above it.
-    height = made.wrap(WIDTH, HEIGHT)[1] + 20.0
-    room = height if height < PAGE else 12 * 2.0 * TABLE_SIZE
-    return Room(room, [_paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)])
+    return [_paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)]
 
 
 def _column_widths(table: Table) -> list[float]:
