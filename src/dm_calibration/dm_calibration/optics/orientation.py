@@ -41,7 +41,7 @@ class Orientation:
         quarters = round(self.rotate_deg / 90.0)
         sag = np.rot90(sag, quarters % 4)
         rest = self.rotate_deg - 90.0 * quarters
-        return np.ascontiguousarray(sag if abs(rest) < _EXACT else _rotated(sag, math.radians(rest)))
+        return np.ascontiguousarray(sag if abs(rest) < _EXACT else _rotated(sag, rest))
 
     def after(self, turn: float, mirrored: bool) -> Orientation:
         """The orientation for a mirror that the maps, as this one has them, show mirrored left to right (or not) and
@@ -56,17 +56,12 @@ class Orientation:
         return Orientation(flip_x, flip_y, (rotate + 180.0) % 360.0 - 180.0)
 
 
-def _rotated(sag: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """The map turned counter-clockwise by `angle`, rad, between pixels linearly.
+def _rotated(sag: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """The map turned counter-clockwise, between pixels linearly.
 
     A pixel has data where its four neighbours had. What the interpolation changes is the curvature over one pixel: less
     than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
     """
     from scipy import ndimage  # here: most benches need no rotation
 
-    cosine, sine = math.cos(angle), math.sin(angle)
-    matrix = np.array([[cosine, sine], [-sine, cosine]])  # of (row, column) of the result to those of the source
-    size = np.ceil(np.abs(matrix) @ sag.shape - 1e-9).astype(int)
-    offset = (np.array(sag.shape) - 1) / 2 - matrix @ ((size - 1) / 2)
-    turned = ndimage.affine_transform(sag, matrix, offset, tuple(size), order=1, cval=np.nan)
-    return np.asarray(turned, dtype=np.float64)
+    return np.asarray(ndimage.rotate(sag, degrees, order=1, cval=np.nan), dtype=np.float64)
