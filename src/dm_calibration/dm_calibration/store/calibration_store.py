@@ -4,6 +4,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
@@ -48,12 +49,8 @@ class CalibrationStore:
     def new_id(self, mirror_name: str, serial: str, created_ns: int) -> str:
         """An id that no file of the folder has: mirror, serial number, time (UTC), and a number when needed."""
         stem = new_id(mirror_name, serial, created_ns)
-        number = 1
-        while True:
-            identifier = stem if number == 1 else f"{stem}-{number}"
-            if not self._file(identifier).exists():
-                return identifier
-            number += 1
+        candidates = chain((stem,), (f"{stem}-{number}" for number in count(2)))
+        return next(identifier for identifier in candidates if not self._file(identifier).exists())
 
     def save(self, calibration: Calibration) -> Path:
         """Write `calibration` to ``<id>.h5``: to a temporary file beside it first, then under its name in one step.
@@ -95,7 +92,16 @@ class CalibrationStore:
             UnknownNameError: no such file, or a name that leads out of the folder.
             CalibrationFileError: the file is damaged, foreign, or of another schema.
         """
-        return _read(self.find(name))
+        file = self.find(name)
+        try:
+            calibration = from_columns(*read_image(file))
+        except (ImageError, CalibrationFileError) as error:
+            raise CalibrationFileError(f"{file.name}: {error}") from error
+        except OSError as error:
+            raise CalibrationFileError(f"{file.name}: cannot be read: {error.strerror or error}") from error
+        if calibration.id != file.name.removesuffix(SUFFIX):
+            raise CalibrationFileError(f"{file.name}: holds the calibration {calibration.id}; was the file renamed?")
+        return calibration
 
     def find(self, name: str) -> Path:
         """The file of the calibration with the id or file name `name`.
@@ -149,16 +155,3 @@ def raw_hash(calibration: Calibration) -> str:
     """Of what was measured, and where: equal only when every bit is."""
     columns = to_columns(calibration)[0]
     return content_hash({name: values for name, values in columns.items() if name.startswith(_RAW)}, {})
-
-
-def _read(file: Path) -> Calibration:
-    try:
-        columns, attributes = read_image(file)
-        calibration = from_columns(columns, attributes)
-    except (ImageError, CalibrationFileError) as error:
-        raise CalibrationFileError(f"{file.name}: {error}") from error
-    except OSError as error:
-        raise CalibrationFileError(f"{file.name}: cannot be read: {error.strerror or error}") from error
-    if calibration.id != file.name.removesuffix(SUFFIX):
-        raise CalibrationFileError(f"{file.name}: holds the calibration {calibration.id}; was the file renamed?")
-    return calibration
