@@ -24,10 +24,9 @@ from dm_common.optics.zernike import TERMS, basis
 TABLE_CHANNELS = 37
 #: Radius of curvature of the spheres, m; positive = concave.
 SPHERES = {"p55": 60.0, "p56": -60.0, "p57": 100.0, "p58": -100.0}
-#: Index in the 21 terms of Z_1^1, Z_2^0, Z_2^2, Z_3^1, Z_3^3, Z_4^0, Z_4^2, Z_4^4, Z_5^1, Z_5^3, Z_5^5, cosine terms.
-#: The order within a degree n is m rising, cosine before sine.
-ZERNIKE_NAMES = ("Z_1^1", "Z_2^0", "Z_2^2", "Z_3^1", "Z_3^3", "Z_4^0", "Z_4^2", "Z_4^4", "Z_5^1", "Z_5^3", "Z_5^5")
-ZERNIKE_INDEX = (1, 3, 4, 6, 8, 10, 11, 13, 15, 17, 19)
+#: Places in the 21 terms of Z_1^1, Z_2^0, Z_2^2, Z_3^1 to Z_5^5: all but piston and the sine terms.
+ZERNIKE_INDEX = tuple(index for index, term in enumerate(TERMS) if term.n and term.kind != "sin")
+ZERNIKE_NAMES = tuple(TERMS[index].name.removesuffix(" cos") for index in ZERNIKE_INDEX)
 #: Amplitude of the Zernike surfaces as a share of the largest one the limits allow.
 ZERNIKE_SHARE = 0.5
 #: Weight of small signals in the solve, relative to the influence function: keeps noise from driving the actuators
