@@ -4,15 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import json
+from typing import Any
+
+import numpy as np
 
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.event_frames import _plain
 from dm_common.measurement import Measurement
 
 
+def measurements(maps: MapSet) -> list[Measurement]:
+    """The maps one by one."""
+    rows = []
+    for k in range(len(maps)):
+        row: dict[str, Any] = {name: getattr(maps, name)[k] for name in maps.columns()}
+        row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
+        if np.isnan(row["nominal"]).all():
+            row["nominal"] = None
+        rows.append(Measurement(points=maps.points, **row))
+    return rows
+
+
 def map_hashes(maps: MapSet) -> list[str]:
     """SHA-256 over what was measured in each map: equal only when every bit is."""
-    return [record_hash(record) for record in maps.measurements()]
+    return [record_hash(record) for record in measurements(maps)]
 
 
 def record_hash(record: Measurement) -> str:

@@ -132,17 +132,6 @@ class MapSet:
             columns[name] = tuple(values) if isinstance(values[0], str) else np.array(values)
         return cls(**columns)
 
-    def measurements(self) -> list[Measurement]:
-        """The maps one by one."""
-        rows = []
-        for k in range(len(self)):
-            row: dict[str, Any] = {name: getattr(self, name)[k] for name in self.columns()}
-            row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
-            if np.isnan(row["nominal"]).all():
-                row["nominal"] = None
-            rows.append(Measurement(points=self.points, **row))
-        return rows
-
     def select(self, keep: NDArray[np.bool_]) -> MapSet:
         """The maps where `keep` (M,) is true."""
         rows = np.flatnonzero(keep)
