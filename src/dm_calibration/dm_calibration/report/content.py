@@ -35,25 +35,19 @@ def _counted(number: int, one: str, many: str) -> str:
     return f"{number or 'No'} {one if number <= 1 else many}"
 
 
-def remeasured(calibration: Calibration) -> str:
-    """The largest re-measured error of the recipes, as text."""
-    recipes = calibration.recipes.recipes
-    if not recipes:
-        return "not measured"
-    return length(max(recipe.max_zernike for recipe in recipes), calibration.wavelength)
-
-
 def summary(calibration: Calibration) -> Section:
     """What a user must know first."""
     fit, hysteresis, wavelength = calibration.fit, calibration.hysteresis, calibration.wavelength
     grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
+    recipes = [recipe.max_zernike for recipe in calibration.recipes.recipes]
+    remeasured = length(max(recipes), wavelength) if recipes else "not measured"
     move = "largest coefficient error of a move in open loop, held out, 95 %"
     rows = [
         ("residual sag of the maps used, in-sample", length(fit.in_sample_rms, wavelength)),
         ("residual sag of maps held out of the fit", length(fit.held_out_rms, wavelength)),
         ("largest coefficient error, held out, 95 % of the maps", length(fit.held_out_max_zernike, wavelength)),
         *([(move, length(hysteresis.held_out_max_zernike, wavelength))] if hysteresis is not None else []),
-        ("largest coefficient error, re-measured (recipes)", remeasured(calibration)),
+        ("largest coefficient error, re-measured (recipes)", remeasured),
         ("figure drift during the run, rms", length(fit.drift_rms, wavelength)),
         ("condition number (rms-normalised modes)", f"{fit.condition_number:.1f}"),
         ("actuators", ", ".join(f"{count} {name}" for name, count in grades.items())),
