@@ -24,7 +24,7 @@ from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import SURFACE
 from dm_calibration.influence.region_weighting import choose_weighting
-from dm_calibration.influence.regression import make_design, regress, usable_sag
+from dm_calibration.influence.regression import make_design, regress
 from dm_calibration.procedure.procedure import Progress
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
@@ -207,7 +207,7 @@ def region_weights_of(calibration: Calibration) -> Floats:
     """(10,) weights of Eq. (8) from the surfaces of a calibration, epsilon by cross-validation."""
     maps = calibration.maps.select(calibration.fit.used)
     design = make_design(maps)
-    _, responses = regress(design, maps, usable_sag(maps, [""] * len(maps)))
+    _, responses = regress(design, maps)
     return choose_weighting(design, maps, responses[:, maps.terms :]).weights
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import usable_sag
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
-from dm_common.optics.piston_tilt import fill_gaps
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.zernike import basis
 
 #: Least uncertainty of a response, m, that of data without noise.
@@ -48,14 +48,18 @@ def responses_of(maps: MapSet) -> Responses:
     Raises:
         TooFewMapsError: no map can be used.
     """
-    usable = np.asarray(np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1))
-    sag = usable_sag(maps, ["" if good else "no data" for good in usable])
+    usable: NDArray[np.bool_] = np.asarray(
+        np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1)
+    )
+    if not usable.any():
+        raise TooFewMapsError(f"none of the {len(maps)} maps holds data")
+    sag = remove_piston_tilt(maps.sag[usable], maps.points)
     modes = basis(maps.points.x, maps.points.y)
     design = np.column_stack((np.ones(len(maps)), maps.applied))[usable]
     model: Floats = maps.coefficients[usable] @ modes.T
     solution = np.zeros((0, 0))
     for _ in range(4):  # the gaps' own share shrinks to nothing in some rounds
-        filled = fill_gaps(sag[usable], model, maps.points)
+        filled = fill_gaps(sag, model, maps.points)
         solution = np.asarray(np.linalg.lstsq(design, filled, rcond=None)[0], dtype=np.float64)
         model = design @ solution
     reduction = Reduction(maps.points, solution[1:].T, maps.terms)

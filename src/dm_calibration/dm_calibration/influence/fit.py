@@ -8,6 +8,7 @@ tilt, so they are removed, area-weighted, from every sag vector before the fit a
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from dm_calibration.influence.regression import (
     least_squares,
     make_design,
     regress,
-    usable_sag,
 )
 from dm_calibration.influence.weights import check_epsilon
 from dm_common import Floats
@@ -156,63 +156,73 @@ def fit_influence(
             raise unknown_name("map label", label, maps.label)
     reasons = screening.unusable(maps, options.valid_fraction_min)
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
-
-    sag = usable_sag(maps, reasons)
-    good, design, fitted, responses = _fit_good(maps, sag, reasons)
-    budget = int(screening.DROPPED_MAX * len(maps))
-    doubtful = False
-    while not doubtful:
-        rest = good.applied[good.reference].mean(axis=0) if good.reference.any() else 0.0
-        outlier = screening.worst_outlier(
-            rms(fitted.residual[:, maps.terms :], maps.points.weight),
-            fitted.leverage,
-            good.applied - rest,
-            _response(fitted, design, good),
-            options.outlier_sigmas,
-            options.hysteresis_allowance,
-        )
+    if all(reasons):
+        raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
+    fitted = _fit_good(maps, reasons)
+    for _ in range(int(screening.DROPPED_MAX * len(maps))):
+        outlier = _worst_outlier(fitted, options)
         if outlier is None:
             break
-        if budget == 0:
-            doubtful = True
-            break
-        budget -= 1
-        index = maps.label.index(good.label[outlier[0]])
+        index = maps.label.index(fitted.maps.label[outlier[0]])
         reasons[index] = outlier[1]
         try:
-            good, design, fitted, responses = _fit_good(maps, sag, reasons)
+            fitted = _fit_good(maps, reasons)
         except TooFewMapsError:  # a doubtful map is better than none
             reasons[index] = ""
-            doubtful = True
+            break
+    doubtful = _worst_outlier(fitted, options) is not None
     remarks = []
     if options.method == "AZWreg":
         # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
-        filled = responses[:, maps.terms :]
-        weighting = choose_weighting(design, good, filled, options.folds, options.epsilon)
-        responses = np.hstack((weighted_coefficients(good, filled, weighting.weights), filled))
-        fitted = least_squares(design, responses)
+        filled = fitted.responses[:, maps.terms :]
+        weighting = choose_weighting(fitted.design, fitted.maps, filled, options.folds, options.epsilon)
+        responses = np.hstack((weighted_coefficients(fitted.maps, filled, weighting.weights), filled))
+        fitted = fitted._replace(regression=least_squares(fitted.design, responses), responses=responses)
         remarks.append(weighting.sentence())
     if doubtful:
         remarks.append(
             f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were "
             "dropped. Doubt this calibration."
         )
-    return _judge(maps, options, rings, limits, reasons, good, design, fitted, responses, remarks)
+    return _judge(maps, options, rings, limits, reasons, fitted, remarks)
 
 
-def _fit_good(maps: MapSet, sag: Floats, reasons: list[str]) -> tuple[MapSet, Design, Regression, Floats]:
-    """Fit the maps without a reason against them: those maps, their design, the regression, its responses."""
+class _Fitted(NamedTuple):
+    """Which maps (M,) are used, these maps, the design of their regression, what comes of it, and its responses."""
+
+    used: NDArray[np.bool_]
+    maps: MapSet
+    design: Design
+    regression: Regression
+    responses: Floats
+
+    @property
+    def response(self) -> Floats:
+        """(N,) rms sag of a unit signal, m."""
+        response, first = np.zeros(self.maps.actuators), self.maps.terms
+        sag = self.regression.coefficients[self.design.drift :, first:]
+        response[self.design.excited] = rms(sag, self.maps.points.weight)
+        return response
+
+
+def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
     used = np.array([not reason for reason in reasons], dtype=bool)
     good = maps.select(used)
     design = make_design(good)
-    fitted, responses = regress(design, good, sag[used])
-    return good, design, fitted, responses
+    return _Fitted(used, good, design, *regress(design, good))
 
 
-def _response(fitted: Regression, design: Design, maps: MapSet) -> Floats:
-    response = np.zeros(maps.actuators)
-    response[design.excited] = rms(fitted.coefficients[design.drift :, maps.terms :], maps.points.weight)
-    return response
+def _worst_outlier(fitted: _Fitted, options: FitOptions) -> tuple[int, str] | None:
+    good = fitted.maps
+    rest = good.applied[good.reference].mean(axis=0) if good.reference.any() else 0.0
+    return screening.worst_outlier(
+        rms(fitted.regression.residual[:, good.terms :], good.points.weight),
+        fitted.regression.leverage,
+        good.applied - rest,
+        fitted.response,
+        options.outlier_sigmas,
+        options.hysteresis_allowance,
+    )
 
 
 def _judge(
@@ -221,25 +231,22 @@ def _judge(
     rings: NDArray[np.int64] | None,
     limits: Limits | None,
     reasons: list[str],
-    good: MapSet,
-    design: Design,
-    fitted: Regression,
-    responses: Floats,
+    fitted: _Fitted,
     remarks: list[str],
 ) -> InfluenceFit:
     """Put the result together with its quality figures."""
-    used = np.array([not reason for reason in reasons], dtype=bool)
+    used, good, design, regression, responses = fitted
     terms, weight = maps.terms, maps.points.weight
     coefficients = np.zeros((maps.actuators, responses.shape[1]))
-    coefficients[design.excited] = fitted.coefficients[design.drift :]
-    figure = fitted.coefficients[: design.drift]
+    coefficients[design.excited] = regression.coefficients[design.drift :]
+    figure = regression.coefficients[: design.drift]
 
     freedom = len(good) - design.unknowns
-    residual = fitted.residual
+    residual = regression.residual
     variance = np.square(residual).sum(axis=0) / freedom
     scatter = float(np.sqrt(variance[terms:] @ weight))
     covariance = np.zeros((maps.actuators, maps.actuators))
-    covariance[np.ix_(design.excited, design.excited)] = fitted.covariance[design.drift :, design.drift :]
+    covariance[np.ix_(design.excited, design.excited)] = regression.covariance[design.drift :, design.drift :]
     standard_error = scatter * np.sqrt(np.diag(covariance))
 
     held_out, tested = quality.held_out_residual(design, responses, good.step, ~good.reference, options.folds)
@@ -257,7 +264,7 @@ def _judge(
     tilt_error = np.sqrt(np.diag(covariance)[:, None] * variance[1:PISTON_TILT])
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
 
-    response = _response(fitted, design, good)
+    response = fitted.response
     grades = quality.grade(
         response,
         standard_error,

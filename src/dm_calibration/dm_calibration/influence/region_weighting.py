@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence import quality
 from dm_calibration.influence.maps import SURFACE, MapSet
-from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress, usable_sag
+from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress
 from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
 from dm_common import Floats
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
@@ -154,8 +154,7 @@ def weighting_of(
     """
     good = maps if used is None else maps.select(used)
     design = make_design(good)
-    sag = usable_sag(good, [""] * len(good))
-    _, responses = regress(design, good, sag)
+    _, responses = regress(design, good)
     return choose_weighting(design, good, responses[:, maps.terms :], folds, epsilon)
 
 

@@ -149,26 +149,6 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     )
 
 
-def usable_sag(maps: MapSet, reasons: list[str]) -> Floats:
-    """Sag of usable maps with piston and tilt removed; gaps still NaN, unusable maps zero.
-
-    Args:
-        reasons: (M,) why a map cannot be used; "" = it can.
-
-    Returns:
-        (M, P) m.
-
-    Raises:
-        TooFewMapsError: no map can be used.
-    """
-    usable = np.array([not reason for reason in reasons], dtype=bool)
-    sag = np.zeros_like(maps.sag)
-    if not usable.any():
-        raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
-    sag[usable] = remove_piston_tilt(maps.sag[usable], maps.points)
-    return sag
-
-
 def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Which maps hold data (M,), and their sag (M, P) m with piston and tilt removed; that of the others is zero.
 
@@ -179,36 +159,34 @@ def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats
         TooFewMapsError: no map holds data.
     """
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
-    sag = usable_sag(maps, ["" if good else "no data" for good in usable])
+    if not usable.any():
+        raise TooFewMapsError(f"none of the {len(maps)} maps holds data")
+    sag = np.zeros_like(maps.sag)
     sag[usable] = fill_gaps(maps.sag[usable], model[usable], maps.points)
     return usable, sag
 
 
-def regress(design: Design, maps: MapSet, sag: Floats) -> tuple[Regression, Floats]:
+def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 
     That is the expectation-maximisation form of least squares with missing data; a gap converges as fast as the other
     maps, rather than its own, determine the fit there.
 
-    Args:
-        sag: (M, P) m, piston and tilt removed, NaN = no data.
-
     Returns:
-        The regression, and its responses (M, K + P): coefficients and sag without gaps, m.
+        The regression, and its responses (M, K + P): coefficients, and sag without gaps, piston and tilt, m.
     """
+    sag = remove_piston_tilt(maps.sag, maps.points)
     gaps = np.isnan(sag).any(axis=1)
-    if not gaps.any():
-        responses = np.hstack((maps.coefficients, sag))
-        return least_squares(design, responses), responses
-    modes = basis(maps.points.x, maps.points.y)
     filled = sag.copy()
-    model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
-    projection = np.linalg.qr(design.matrix)[0]
-    for _ in range(GAP_ROUNDS):
-        before = filled[gaps]
-        filled[gaps] = fill_gaps(sag[gaps], model, maps.points)
-        if np.abs(filled[gaps] - before).max(initial=0.0) < GAP_TOLERANCE:  # NaN in the first round
-            break
-        model = projection[gaps] @ (projection.T @ filled)
+    if gaps.any():
+        modes = basis(maps.points.x, maps.points.y)
+        model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
+        projection = np.linalg.qr(design.matrix)[0]
+        for _ in range(GAP_ROUNDS):
+            before = filled[gaps]
+            filled[gaps] = fill_gaps(sag[gaps], model, maps.points)
+            if np.abs(filled[gaps] - before).max(initial=0.0) < GAP_TOLERANCE:  # NaN in the first round
+                break
+            model = projection[gaps] @ (projection.T @ filled)
     responses = np.hstack((maps.coefficients, filled))
     return least_squares(design, responses), responses
