@@ -83,6 +83,13 @@ def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], w
     ]
 
 
+def folds_of(step: NDArray[np.int64], held: NDArray[np.bool_], folds: int) -> NDArray[np.int64]:
+    """(M,) fold of each map `held` (M,), dealt out by commanded states `step` (M,); -1 = it stays in every fit."""
+    fold = np.full(step.size, -1)
+    fold[held] = np.unique(step[held], return_inverse=True)[1] % folds
+    return fold
+
+
 def held_out_residual(
     design: Design, responses: Floats, step: NDArray[np.int64], held: NDArray[np.bool_], folds: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
@@ -104,12 +111,10 @@ def held_out_residual(
         uncertain as a measurement is not, because the fit without its fold knows too little about what it moves;
         unless no map could be tested otherwise.
     """
-    order = np.unique(step[held], return_inverse=True)[1]
-    fold = np.full(step.size, -1)
-    fold[held] = order % folds
+    fold = folds_of(step, held, folds)
     residual = np.full(responses.shape, np.nan)
     inflation = np.full(step.size, np.inf)
-    for k in range(min(folds, int(order.max(initial=-1)) + 1)):
+    for k in range(int(fold.max(initial=-1)) + 1):
         left_out = fold == k
         # Where a fold holds the only map that tells two actuators apart, this is the smallest solution.
         inverse = np.linalg.pinv(design.matrix[~left_out], rcond=1e-9)

@@ -99,12 +99,20 @@ def choose_weighting(
         ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2;
             epsilon not above 0; maps with other than 21 terms.
     """
+    if folds < 2:
+        raise ValueError(f"folds = {folds}: must be at least 2")
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
     chosen = sample_surfaces(maps)
     # `sag` has its gaps filled from a fit: a region that nobody saw would get its weight from what was made up.
     regional_rms(maps.sag[chosen], maps.points, labels=maps.select(chosen).label)
-    fold = _folds(maps, chosen, folds)
+    states = np.unique(maps.step[chosen]).size
+    if states < SURFACES_MIN:
+        raise TooFewMapsError(
+            f"{states} sample surfaces: the region weights of AZWreg come from variances over surfaces and need "
+            f"at least {SURFACES_MIN}; measure more surfaces or use AZreg"
+        )
+    fold = quality.folds_of(maps.step, chosen, folds)
     fractions = np.array((0.0, *EPSILON_CANDIDATES))  # 0 stands for no weights at all
     variance = _variance(design, maps, sag, chosen)
     scale = float(np.median(variance))
@@ -112,6 +120,7 @@ def choose_weighting(
     # Which held-out predictions are extrapolation does not depend on the responses: any column tells.
     _, tested = quality.held_out_residual(design, sag[:, :1], maps.step, chosen, folds)
     squares = np.zeros(fractions.size)
+    modes = basis(maps.points.x, maps.points.y)
     for k in range(int(fold.max()) + 1):
         left_out = fold == k
         judged = left_out & tested
@@ -122,7 +131,9 @@ def choose_weighting(
         r = _variance(train, maps.select(~left_out), sag[~left_out], chosen[~left_out])
         for e, share in enumerate(fractions):
             weights = region_weights(r, share * scale) if share else np.ones(len(AREA_FRACTIONS))
-            squares[e] += _squares(predicted, sag[judged], maps, weights)
+            terms = predicted @ coefficient_operator(maps.points, weights).T
+            error = remove_piston_tilt(sag[judged] - terms @ modes.T, maps.points)
+            squares[e] += np.square(regional_rms(error, maps.points)).sum()
     score = np.sqrt(squares / (len(AREA_FRACTIONS) * max(int((tested & chosen).sum()), 1)))
     candidates = fractions[1:] * scale
     mildest_best = float(candidates[::-1][np.argmin(score[1:][::-1])])
@@ -141,18 +152,18 @@ def choose_weighting(
 
 
 def weighting_of(
-    maps: MapSet, used: NDArray[np.bool_] | None = None, folds: int = 10, epsilon: float | None = None
+    maps: MapSet, used: NDArray[np.bool_], folds: int = 10, epsilon: float | None = None
 ) -> RegionWeighting:
     """Region weights of the maps of a calibration, for a command solve or a report; see :func:`choose_weighting`.
 
     Args:
-        used: (M,) which maps entered the fit; None = all.
+        used: (M,) which maps entered the fit.
 
     Raises:
         TooFewMapsError: the maps do not determine the influence function, or fewer than four sample surfaces.
         EmptyRegionError, ValueError: as :func:`choose_weighting`.
     """
-    good = maps if used is None else maps.select(used)
+    good = maps.select(used)
     design = make_design(good)
     _, responses = regress(design, good)
     return choose_weighting(design, good, responses[:, maps.terms :], folds, epsilon)
@@ -172,21 +183,6 @@ def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
     return np.asarray(coefficients)
 
 
-def _folds(maps: MapSet, chosen: NDArray[np.bool_], folds: int) -> NDArray[np.int64]:
-    """(M,) fold of each sample surface, -1 for maps that stay in every fit."""
-    if folds < 2:
-        raise ValueError(f"folds = {folds}: must be at least 2")
-    states, state = np.unique(maps.step[chosen], return_inverse=True)
-    if states.size < SURFACES_MIN:
-        raise TooFewMapsError(
-            f"{states.size} sample surfaces: the region weights of AZWreg come from variances over surfaces and need "
-            f"at least {SURFACES_MIN}; measure more surfaces or use AZreg"
-        )
-    fold = np.full(len(maps), -1, dtype=np.int64)
-    fold[chosen] = state % folds
-    return fold
-
-
 def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """(R,) variance over the chosen maps of the regional rms surface control error, G being that of AZreg."""
     coefficients = np.linalg.pinv(design.matrix, rcond=1e-9) @ maps.coefficients
@@ -201,10 +197,3 @@ def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool
             "weight by: measure surfaces that differ, or use AZreg"
         )
     return np.asarray(variance)
-
-
-def _squares(predicted: Floats, measured: Floats, maps: MapSet, weights: Floats) -> float:
-    """Sum over maps and regions of the mean square error of the 21 terms fitted, with weights, to `predicted`."""
-    terms = predicted @ coefficient_operator(maps.points, weights).T
-    error = remove_piston_tilt(measured - terms @ basis(maps.points.x, maps.points.y).T, maps.points)
-    return float(np.square(regional_rms(error, maps.points)).sum())
