@@ -8,7 +8,6 @@ found by Gauss-Newton around that (variable projection [14]).
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,17 +111,8 @@ class CandidateProblem:
         self.radius = candidate.radius
         self._plays = run.along(lambda signals: play_features(signals, self.radius, candidate.powers))
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
-        self._scale(scatter)
-
-    def _scale(self, scatter: Floats) -> None:
         self._scatter = scatter
-        self._measured = self.run.responses.values / scatter
-
-    def scaled(self, scatter: Floats) -> CandidateProblem:
-        """The same problem with another uncertainty (D,) of each response."""
-        other = copy.copy(self)
-        other._scale(scatter)
-        return other
+        self._measured = run.responses.values / scatter
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
         """Fit to the rows in `keep` (M,), from `start` or from a guess.

@@ -102,9 +102,7 @@ def identify(
     test = np.zeros_like(usable) if test is None else test & usable
     early = bool(test[: len(test) // 2].any())
     train = usable & ~test
-    preisach = CandidateProblem(run, PREISACH, np.ones(run.responses.values.shape[1]))
-    scatter = _scatter(preisach, train)
-    preisach = preisach.scaled(scatter)
+    scatter = _scatter(run, train)
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
@@ -147,7 +145,7 @@ def identify(
 
     for candidate in candidates:
         if not candidate.own:
-            consider(preisach if candidate == PREISACH else CandidateProblem(run, candidate, scatter))
+            consider(CandidateProblem(run, candidate, scatter))
         elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             common.sort(key=lambda scored: scored[0])
             near = [fit for score, fit in common if score < NEAR * common[0][0]]
@@ -224,14 +222,14 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     return tuple(quiet.tolist())
 
 
-def _scatter(rich: CandidateProblem, keep: Rows) -> Floats:
+def _scatter(run: Run, keep: Rows) -> Floats:
     """(D,) uncertainty of each response, from what a rich law leaves: one value for coefficients, one per pattern."""
-    responses = rich.run.responses
+    responses = run.responses
     scatter = np.ones(responses.values.shape[1])
     scatter[: responses.coefficients] = 1e-9
     scatter[responses.coefficients :] = 1e-8
     for _ in range(2):
-        left = rich.scaled(scatter).fit(keep, evaluations=4).residual[keep]
+        left = CandidateProblem(run, PREISACH, scatter).fit(keep, evaluations=4).residual[keep]
         # Robust: maps that no law explains must not set the scale.
         scatter = responses.scatter(MAD_TO_SIGMA * np.median(np.abs(left), axis=0))
     return scatter
