@@ -33,16 +33,15 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
 
     The first is of errors that all actuators share, the second of those of each by itself.
     """
-    values, keep = run.responses.values, run.responses.usable
+    keep = run.responses.usable
     position, effective = run.follow(replace(law, creep_rate=0.0)), run.follow(law)
     features = np.concatenate((position[:, None], run.creep_states(position)), axis=1)
-    figure = run.figure[keep]
-    design = np.hstack((figure, effective[keep]))
-    solution = np.linalg.lstsq(design, values[keep], rcond=1e-10)[0]
-    left = values[keep] - design @ solution
-    scatter = run.responses.scatter(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)))
-    gains = solution[figure.shape[1] :] / scatter
-    seen = without(features[keep], basis_of(figure))
+    gains, left = run.gains(effective, keep)
+    left = left[keep]
+    unknowns = run.figure.shape[1] + len(gains)
+    scatter = run.responses.scatter(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - unknowns, 1)))
+    gains = gains / scatter
+    seen = without(features[keep], basis_of(run.figure[keep]))
 
     together = seen @ gains
     evidence = np.einsum("mjd,mkd->jk", together, together)

@@ -171,7 +171,7 @@ class OwnLaws:
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
         free = basis_of(self.run.figure[keep])
         crept = self._with_creep(features, creep, patterns)
-        gains, residual = self._gains(crept, patterns, keep)
+        gains, residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
@@ -180,7 +180,7 @@ class OwnLaws:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
                 crept = self._with_creep(features, creep, patterns)
-            gains, residual = self._gains(crept, patterns, keep)
+            gains, residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)
         return patterns, creep, scatter, residual
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
@@ -223,13 +223,6 @@ class OwnLaws:
         added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[:count])
         slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
         return features * (1.0 + slope[:, None]) + added
-
-    def _gains(self, crept: Floats, patterns: Floats, keep: Rows) -> tuple[Floats, Floats]:
-        """Gains (N, D) and residual (M, D), m."""
-        design = np.hstack((self.run.figure, np.einsum("mfn,fn->mn", crept, patterns)))
-        values = self.run.responses.values
-        solution = np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0]
-        return solution[self.run.figure.shape[1] :], values - design @ solution
 
     def _scatter_of(self, residual: Floats) -> Floats:
         """(D,) m, one value for all coefficients; maps that no law explains do not set it."""

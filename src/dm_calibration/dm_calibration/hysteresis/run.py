@@ -115,6 +115,12 @@ class Run:
             columns += [step, fading]
         return np.column_stack(columns)
 
+    def gains(self, effective: Floats, keep: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Gains (N, D) of effective signals (M, N) by the rows in `keep` (M,), and what they leave of all (M, D), m."""
+        design, values = np.hstack((self.figure, effective)), self.responses.values
+        solution: Floats = np.asarray(np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0], dtype=np.float64)
+        return solution[self.figure.shape[1] :], values - design @ solution
+
 
 def run_of(maps: MapSet) -> Run:
     """The maps of one run, in the order measured, which begins with a degauss.

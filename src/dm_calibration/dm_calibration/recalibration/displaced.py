@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.reduction import Reduction
+from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.quality import NO_RESPONSE
 from dm_calibration.procedure.forecast import typical_response
 from dm_calibration.recalibration.drift import Displaced

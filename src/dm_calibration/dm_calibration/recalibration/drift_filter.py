@@ -1,6 +1,6 @@
 """Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
 
-In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says ``v = v0 + V
+In the reduced values of a map (:class:`~dm_calibration.hysteresis.responses.Reduction`) a calibration says ``v = v0 + V
 e`` with the effective signals e. Later it is ``v = v0 + d + c + V diag(e) (1 + g)``: gains have changed by the shares
 g, the figure by d, and by c of creep slower than the calibration's run shows. Where maps tell the temperature, t above
 that of the calibration, ``k t V e + h t`` comes on top: k of all gains and h of the figure do not change. Creep fades,
@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
-from dm_calibration.hysteresis.reduction import Reduction
+from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
