@@ -18,7 +18,7 @@ from dm_common.mirror import Mirror
 from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
-from dm_common.optics.zernike import TERMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 
 #: Channels 1..37 have a surface of their own in Table 1.
 TABLE_CHANNELS = 37
@@ -169,12 +169,16 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
         index = ZERNIKE_INDEX[_ZERNIKES[name]]
         unit = np.zeros(len(TERMS))
         unit[index] = 1.0
-        if index < 3:
-            return _tilt_surface(name, unit, model, mirror)
+        tilt = index < PISTON_TILT
         flat, _ = solve_shape(np.zeros(points.x.size), model, mirror)
-        # Wide bounds: the direction is scaled to the limits afterwards.
-        direction = _unbounded(basis(points.x, points.y) @ unit, model)
+        # Of tilt in proportion to x, since the maps do not show it; else without bounds, scaled to them afterwards.
+        plane = mirror.x / (np.abs(mirror.x).max() or 1.0)
+        direction = plane if tilt else _unbounded(basis(points.x, points.y) @ unit, model)
         amplitude = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
+        if tilt:  # a coefficient that is not known in metres counts as 0 after removal of tilt
+            signals, _ = mirror.limits.scaled(flat + amplitude * direction)
+            target = f"{name}: Z_1^1 as a plane of signals of +-{amplitude:.2f}; its size in metres is not measured"
+            return Surface(name, signals, 0.0 * unit, target=target)
         nominal = amplitude * unit
         wanted = f"{ZERNIKE_NAMES[_ZERNIKES[name]]} of {amplitude * 1e9:.0f} nm"
     else:
@@ -200,17 +204,3 @@ def _unbounded(target: Floats, model: LinearModel) -> Floats:
     matrix, _ = _damped(model)
     wanted = np.sqrt(model.points.weight) * remove_piston_tilt(target[None, :], model.points)[0]
     return np.asarray(np.linalg.lstsq(matrix, np.concatenate((wanted, np.zeros(matrix.shape[1]))), rcond=None)[0])
-
-
-def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -> Surface:
-    """Z_1^1: the actuators move in proportion to x, because the maps do not show tilt.
-
-    The amplitude is that of a rigid tilt in signals; the coefficient aimed at is not known in metres and counts as 0
-    after removal of tilt.
-    """
-    flat, _ = solve_shape(np.zeros(model.points.x.size), model, mirror)
-    direction = mirror.x / np.abs(mirror.x).max() if np.abs(mirror.x).max() > 0 else np.zeros(mirror.actuators)
-    share = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
-    signals, _ = mirror.limits.scaled(flat + share * direction)
-    target = f"{name}: Z_1^1 as a plane of signals of +-{share:.2f}; its size in metres is not measured"
-    return Surface(name, signals, 0.0 * unit, target=target)
