@@ -160,7 +160,7 @@ def fit_influence(
         raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
     fitted = _fit_good(maps, reasons)
     for _ in range(int(screening.DROPPED_MAX * len(maps))):
-        outlier = _worst_outlier(fitted, options)
+        outlier = fitted.worst_outlier(options)
         if outlier is None:
             break
         index = maps.label.index(fitted.maps.label[outlier[0]])
@@ -170,7 +170,6 @@ def fit_influence(
         except TooFewMapsError:  # a doubtful map is better than none
             reasons[index] = ""
             break
-    doubtful = _worst_outlier(fitted, options) is not None
     remarks = []
     if options.method == "AZWreg":
         # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
@@ -179,7 +178,7 @@ def fit_influence(
         responses = np.hstack((weighted_coefficients(fitted.maps, filled, weighting.weights), filled))
         fitted = fitted._replace(regression=least_squares(fitted.design, responses), responses=responses)
         remarks.append(weighting.sentence())
-    if doubtful:
+    if fitted.worst_outlier(options) is not None:
         remarks.append(
             f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were "
             "dropped. Doubt this calibration."
@@ -196,13 +195,20 @@ class _Fitted(NamedTuple):
     regression: Regression
     responses: Floats
 
-    @property
-    def response(self) -> Floats:
-        """(N,) rms sag of a unit signal, m."""
-        response, first = np.zeros(self.maps.actuators), self.maps.terms
-        sag = self.regression.coefficients[self.design.drift :, first:]
-        response[self.design.excited] = rms(sag, self.maps.points.weight)
-        return response
+    def worst_outlier(self, options: FitOptions) -> tuple[int, str] | None:
+        """See :func:`~dm_calibration.influence.screening.worst_outlier`."""
+        maps, regression, weight = self.maps, self.regression, self.maps.points.weight
+        response = np.zeros(maps.actuators)
+        response[self.design.excited] = rms(regression.coefficients[self.design.drift :, maps.terms :], weight)
+        rest = maps.applied[maps.reference].mean(axis=0) if maps.reference.any() else 0.0
+        return screening.worst_outlier(
+            rms(regression.residual[:, maps.terms :], weight),
+            regression.leverage,
+            maps.applied - rest,
+            response,
+            options.outlier_sigmas,
+            options.hysteresis_allowance,
+        )
 
 
 def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
@@ -210,19 +216,6 @@ def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
     good = maps.select(used)
     design = make_design(good)
     return _Fitted(used, good, design, *regress(design, good))
-
-
-def _worst_outlier(fitted: _Fitted, options: FitOptions) -> tuple[int, str] | None:
-    good = fitted.maps
-    rest = good.applied[good.reference].mean(axis=0) if good.reference.any() else 0.0
-    return screening.worst_outlier(
-        rms(fitted.regression.residual[:, good.terms :], good.points.weight),
-        fitted.regression.leverage,
-        good.applied - rest,
-        fitted.response,
-        options.outlier_sigmas,
-        options.hysteresis_allowance,
-    )
 
 
 def _judge(
@@ -264,7 +257,7 @@ def _judge(
     tilt_error = np.sqrt(np.diag(covariance)[:, None] * variance[1:PISTON_TILT])
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
 
-    response = fitted.response
+    response = rms(coefficients[:, terms:], weight)
     grades = quality.grade(
         response,
         standard_error,
