@@ -171,9 +171,7 @@ def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     """
     first = 1 if tilt_known else 3
     rms = np.asarray(TERM_RMS)[first : len(influence_zernike), np.newaxis]
-    singular = np.linalg.svd(influence_zernike[first:] * rms, compute_uv=False)
-    smallest = float(singular[-1])
-    return float(singular[0] / smallest) if smallest > 0.0 else float("inf")
+    return float(np.linalg.cond(influence_zernike[first:] * rms))
 
 
 def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, untested: int) -> list[str]:

@@ -100,8 +100,7 @@ def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
             f"{len(points)} sampling points for {len(TERMS)} coefficients: at least {len(TERMS)} are needed"
         )
     row = np.sqrt(points.weight) * point_weights(points, weights)
-    q, r = np.linalg.qr(row[:, np.newaxis] * basis(points.x, points.y))
-    diagonal = np.abs(np.diag(r))
-    if diagonal.min() < RANK_TOLERANCE * diagonal.max():
+    weighted = row[:, np.newaxis] * basis(points.x, points.y)
+    if np.linalg.cond(weighted) > 1.0 / RANK_TOLERANCE:
         raise ValueError(f"the {len(points)} sampling points do not tell the {len(TERMS)} terms apart: spread them out")
-    return np.asarray(np.linalg.solve(r, q.T * row))
+    return np.asarray(np.linalg.pinv(weighted) * row)
