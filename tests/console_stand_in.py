@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from dm_common.ros.worker import WorkerService
 from dm_tools.running_suite import NEEDED
 
 RADIUS = 8e-3
+#: Of goals, as action_msgs/GoalStatus has them.
+EXECUTING, SUCCEEDED = 2, 4
 
 
 class StandIn:
@@ -99,3 +102,35 @@ def calibration(actuators: int, radius: float = RADIUS) -> Calibration:
         influence_sag=array("d", sag.ravel()),
         sag_offset=array("d", np.zeros(300)),
     )
+
+
+class FakeNode:
+    """Hands out the callbacks that a node would call."""
+
+    def __init__(self) -> None:
+        self.callbacks: dict[str, Any] = {}
+        self.publishers = 1
+
+    def create_subscription(self, _kind: Any, topic: str, callback: Any, _qos: Any) -> None:
+        self.callbacks[topic] = callback
+
+    def create_client(self, _kind: Any, _name: str) -> Any:
+        return SimpleNamespace(call_async=lambda request: setattr(self, "asked", request))
+
+    def count_publishers(self, _topic: str) -> int:
+        return self.publishers
+
+
+class Goal:
+    """A goal with its messages."""
+
+    def __init__(self, node: FakeNode, number: int) -> None:
+        self.node, self.identity = node, SimpleNamespace(uuid=[number] * 16)
+
+    def tell(self, status: int) -> None:
+        entry = SimpleNamespace(goal_info=SimpleNamespace(goal_id=self.identity), status=status)
+        self.node.callbacks["calibrate/_action/status"](SimpleNamespace(status_list=[entry]))
+
+    def feed(self, step: int, residual: float) -> None:
+        feedback = SimpleNamespace(step=step, residual_rms=residual)
+        self.node.callbacks["calibrate/_action/feedback"](SimpleNamespace(goal_id=self.identity, feedback=feedback))

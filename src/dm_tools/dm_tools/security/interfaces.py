@@ -1,7 +1,7 @@
 """What every node of the suite publishes, subscribes to, offers and calls: the one source of all policies.
 
-`tests/test_security_profile.py` starts the nodes and compares this table with their ROS graph: nothing may be missing,
-and nothing may stand here that no node uses.
+`tests/repository/test_security_profile.py` starts the nodes and compares this table with their ROS graph: nothing may
+be missing, and nothing may stand here that no node uses.
 """
 
 from dataclasses import dataclass, replace

@@ -23,6 +23,7 @@ from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, Mi
 from dm_msgs.srv import SetFocus
 from typer.testing import CliRunner
 
+from console_stand_in import EXECUTING, FakeNode, Goal
 from dm_client import DeformableMirrorError
 from dm_common.errors import ErrorCode
 from dm_common.ros.domains import own_domain
@@ -35,9 +36,8 @@ from dm_tools.verbs.focus import _show
 from dm_tools.verbs.replay import replay
 from dm_tools.verbs.report import folder_with, newest_store
 from dm_tools.verbs.up import first_command, lacks, only_suite
-from test_console_external_goals import EXECUTING, FakeNode, Goal
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)

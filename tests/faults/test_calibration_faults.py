@@ -18,6 +18,7 @@ from action_msgs.msg import GoalStatus
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import ListCalibrations, LoadCalibration
+from stuck_calibration import MARK
 
 from calibration_stand_in import StandIn
 from dm_calibration.procedure.run_journal import read_run
@@ -26,7 +27,6 @@ from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, make_mirror
 from map_hashes import map_hashes, record_hash
-from stuck_calibration import MARK
 from support import NodeProcess, Observer, wait_until
 
 ACTUATORS = 7
@@ -149,7 +149,7 @@ def test_killed_in_the_middle_of_writing_nothing_is_lost_or_measured_twice(
 ) -> None:
     settings = tmp_path / "stuck.yaml"
     settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters(folder)}}))
-    script = Path(__file__).with_name("stuck_calibration.py")
+    script = Path(__file__).parents[1] / "stuck_calibration.py"
     log = (tmp_path / "stuck.log").open("wb")
     process = subprocess.Popen(
         [sys.executable, str(script), place, "--ros-args", "--params-file", str(settings)],

@@ -536,7 +536,7 @@ def test_a_senseless_region_keeps_the_node_from_its_work_with_the_reason(start: 
 
 
 def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) -> None:
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     example = (root / "examples" / "camera_focus.py").read_text()
     code = example[example.index("from dm_autofocus") :]
     page = (root / "docs" / "camera.md").read_text()
@@ -556,7 +556,7 @@ def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) 
 
 
 def test_the_vision_node_of_the_examples_focuses_on_what_it_detects() -> None:
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     rclpy.init()
     try:
         node = runpy.run_path(str(root / "examples" / "vision_node.py"))["VisionNode"]()

@@ -29,7 +29,7 @@ from dm_autofocus.optics import FocusOptics, dioptre_of
 from dm_common.ros import qos
 from support import Observer, wait_until
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "cpp"
 SOURCES = sorted((EXAMPLE / "src").glob("*.cpp"))
 
@@ -40,7 +40,7 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not (ROOT / "install" / "dm_msgs").is_dir():
         pytest.skip("dm_msgs is not built in this checkout")
     folder = tmp_path_factory.mktemp("cpp")
-    prefixes = os.pathsep.join([os.environ["CMAKE_PREFIX_PATH"], str(Path(__file__).parent / "rclcpp_stand_in")])
+    prefixes = os.pathsep.join([os.environ["CMAKE_PREFIX_PATH"], str(Path(__file__).parents[1] / "rclcpp_stand_in")])
     ninja = ["-GNinja"] if shutil.which("ninja") else []
     options = [*ninja, "-DCMAKE_CXX_FLAGS=-Werror", f"-DPython3_EXECUTABLE={sys.executable}"]
     shown = ["--event-handlers", "console_cohesion+"]

@@ -20,7 +20,7 @@ from dm_common.optics.zernike import PISTON_TILT
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_simulation.mirror.zernike import Array, evaluate, terms_to_order
-from test_instrument_errors import FIELD, PIXELS, SETTINGS, run
+from simulated_instrument import FIELD, PIXELS, SETTINGS, run
 
 Shape = Callable[[Array, Array], Array]
 TERMS = terms_to_order(12)[PISTON_TILT:]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = sorted(path.name for path in (ROOT / "src").iterdir() if (path / path.name / "__init__.py").is_file())
 #: Folders beside the installed packages, by the name under which they are imported.
 CHECKOUT = {"studies": ROOT / "studies", "fault_injection": ROOT / "tests" / "fault_injection"}

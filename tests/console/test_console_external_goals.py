@@ -2,46 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 from dm_msgs.action import Calibrate
 
+from console_stand_in import EXECUTING, SUCCEEDED, FakeNode, Goal
 from dm_tools.long_actions import ExternalGoals
-
-EXECUTING, SUCCEEDED = 2, 4
-
-
-class FakeNode:
-    """Hands out the callbacks that a node would call."""
-
-    def __init__(self) -> None:
-        self.callbacks: dict[str, Any] = {}
-        self.publishers = 1
-
-    def create_subscription(self, _kind: Any, topic: str, callback: Any, _qos: Any) -> None:
-        self.callbacks[topic] = callback
-
-    def create_client(self, _kind: Any, _name: str) -> Any:
-        return SimpleNamespace(call_async=lambda request: setattr(self, "asked", request))
-
-    def count_publishers(self, _topic: str) -> int:
-        return self.publishers
-
-
-class Goal:
-    """A goal with its messages."""
-
-    def __init__(self, node: FakeNode, number: int) -> None:
-        self.node, self.identity = node, SimpleNamespace(uuid=[number] * 16)
-
-    def tell(self, status: int) -> None:
-        entry = SimpleNamespace(goal_info=SimpleNamespace(goal_id=self.identity), status=status)
-        self.node.callbacks["calibrate/_action/status"](SimpleNamespace(status_list=[entry]))
-
-    def feed(self, step: int, residual: float) -> None:
-        feedback = SimpleNamespace(step=step, residual_rms=residual)
-        self.node.callbacks["calibrate/_action/feedback"](SimpleNamespace(goal_id=self.identity, feedback=feedback))
 
 
 def watched() -> tuple[ExternalGoals, FakeNode]:

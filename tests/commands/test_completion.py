@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SHELL = shutil.which("bash") or ""
 
 pytestmark = [pytest.mark.processes, pytest.mark.skipif(not SHELL, reason="no bash here")]

@@ -28,7 +28,7 @@ from studies.benchmarks.timing import Effort, medians
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 BASELINE: dict[str, Any] = json.loads((ROOT / "benchmarks" / "baseline.json").read_text())
 
 #: How much worse than in the committed run a ratio may be.

@@ -21,7 +21,7 @@ from dm_bringup.suite import load_config
 from dm_common.ros.parameters import REQUIRED
 from studies.documentation.parameters import TABLES, parameters_page
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src"
 
 _NODES = {"dm_msgs", "dm_common"}

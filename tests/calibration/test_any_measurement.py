@@ -18,7 +18,7 @@ from dm_simulation.mirror.membrane import Membrane, MembraneConfig
 
 pytestmark = pytest.mark.slow
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "compare_laws.py"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "compare_laws.py"
 STATIC = (CANDIDATES[0], Candidate("squares", 0, 2, 0), Candidate("static", 0, 3, 0))
 LENSLETS, APERTURE, STEP = 8, 0.010, 1e-5  # a side; m; m
 NOISE = 4e-7  # rad, of a slope

@@ -9,7 +9,7 @@ import pytest
 
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 
-SOURCE = Path(__file__).resolve().parents[1] / "src"
+SOURCE = Path(__file__).resolve().parents[2] / "src"
 FILES = [path for path in SOURCE.rglob("*.py") if "build" not in path.parts]
 #: Run text as code, or rebuild objects from bytes.
 CALLS = {"eval", "exec", "os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput", "yaml.load"}

@@ -24,9 +24,7 @@ from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_tools.cli import make_app
 from dm_tools.verbs.instrument import _table
-
-PIXELS, FIELD = 200, 0.022
-SETTINGS = IngestSettings(aperture_radius=0.0095, pitch=FIELD / PIXELS)
+from simulated_instrument import FIELD, PIXELS, SETTINGS, run
 
 
 @contextmanager
@@ -43,16 +41,6 @@ def bench(folder: Path, **instrument: Any) -> Iterator[VirtualBench]:
         yield running
     finally:
         running.close()
-
-
-def run(*arguments: object) -> dict[str, Any]:
-    """The parameters that `./dm instrument` prints."""
-    import yaml
-
-    result = CliRunner().invoke(make_app(), ["instrument", *map(str, arguments)])
-    assert result.exit_code == 0, result.output
-    text = result.stdout[result.stdout.index("/**/") :].partition("next:")[0]
-    return dict(yaml.safe_load(text)["/**/interferometer"]["ros__parameters"])
 
 
 def error(file: Path, truth: NDArray[np.float64], settings: IngestSettings) -> float:
