@@ -18,7 +18,6 @@ from action_msgs.msg import GoalStatus
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import ListCalibrations, LoadCalibration
-from stuck_calibration import MARK
 
 from calibration_stand_in import StandIn
 from dm_calibration.procedure.run_journal import read_run
@@ -27,6 +26,7 @@ from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, make_mirror
 from map_hashes import map_hashes, record_hash
+from stuck_calibration import MARK
 from support import NodeProcess, Observer, wait_until
 
 ACTUATORS = 7

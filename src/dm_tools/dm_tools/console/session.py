@@ -54,7 +54,7 @@ class Progress:
         match action:
             case "move_focus":
                 self.step, self.steps = round(100 * feedback.progress), 100
-                self.text = ("planning", "moving", "settling")[min(feedback.phase, 2)]
+                self.text = feedback.phase
             case "degauss":
                 self.step, self.steps = feedback.step, feedback.steps
                 self.text = "alternating with falling amplitude about mid range"
