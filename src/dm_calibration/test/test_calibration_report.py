@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dm_msgs.msg import Capabilities
 from reportlab.platypus import LongTable, Paragraph
 
 from dm_calibration.calibration import Calibration
@@ -156,7 +157,7 @@ def test_message_and_certificate_agree(
     grades = np.array([grade] + [0] * 36, dtype=np.uint8)
     judged = replace(calibration, fit=replace(calibration.fit, grades=grades, held_out_max_zernike=promised))
     message = calibration_message(judged, None, "mirror", error_max)
-    assert (message.quality == message.CALIBRATED) is good
+    assert (message.quality == Capabilities.CALIBRATED) is good
     assert ("<td>calibrated</td>" in one_html("", [certificate(judged, {}, (), error_max)])) is good
 
 
