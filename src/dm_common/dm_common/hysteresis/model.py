@@ -35,7 +35,7 @@ CREEP_RATE_MAX = 0.2
 #: How much more a request may err, where there is hysteresis, than the held-out moves of the calibration, which follow
 #: each other within seconds: requests after a degauss err 1.2 to 2.6 times as much as the same law does on those moves.
 #: Linear Duhem operators make those moves a fifth to a third better, what creep leaves of requests not.
-IN_USE, IN_USE_FADING = 1.4, 1.9
+IN_USE, IN_USE_FADING = 1.4, 1.6
 
 
 @dataclass(frozen=True, eq=False)
