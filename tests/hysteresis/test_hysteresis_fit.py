@@ -12,6 +12,7 @@ import pytest
 
 from dm_calibration.hysteresis import hysteresis_fit
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.features import play_values
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, run_of
@@ -19,6 +20,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.errors import MeasurementError
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
 from dm_common.mirror import Applied
@@ -96,17 +98,41 @@ def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() ->
     own = np.exp(0.3 * np.random.default_rng(4).standard_normal((maps.actuators, len(law.creep_time))))
     effective, law = hysteresis_fit._followed(maps, replace(law, creep_spectrum=own / own.mean()), run_of(maps))
     assert np.abs(law.crept).max() > 0.1
-    rest, moved = np.zeros(maps.actuators), 1e-9 * maps.moved_ns
+    rest, moved = np.zeros(maps.actuators), maps.moved_s() + 1e-9 * int(maps.stamp_ns[0])
     tracker = HysteresisTracker(law)
     tracker.observe(Applied(law.crept_at - 60.0, rest, 0, None, 0, False))
     tracker.observe(Applied(law.crept_at - 0.5, rest, 2, rest, 1, True))
-    for turns, (shape, when) in enumerate(zip(maps.applied, moved, strict=True), start=3):
+    degausses = 1 + np.cumsum(maps.degaussed)
+    for turns, (shape, when, count) in enumerate(zip(maps.applied, moved, degausses, strict=True), start=3):
         before = tracker.state
         assert before is not None
-        tracker.observe(Applied(max(float(when), law.crept_at), shape, turns, before.signals, 1, True))
+        tracker.observe(Applied(max(float(when), law.crept_at), shape, turns, before.signals, int(count), True))
     assert tracker.state is not None
     found = law.effective(law.advance(tracker.state, 1e-9 * int(maps.stamp_ns[-1])))
     np.testing.assert_allclose(found, effective.applied[-1], atol=2e-5)
+
+
+def test_a_degauss_in_the_course_of_a_run_wipes_its_loops_and_not_its_creep() -> None:
+    """In features, and in the effective signals of a law."""
+    rng = np.random.default_rng(5)
+    signals, time = rng.uniform(-1.0, 1.0, (30, 3)), 2.0 * np.arange(30)
+    degaussed = np.arange(30) == 20
+    signals[degaussed] = 0.0
+    nothing = Responses(np.zeros((30, 1)), 1, np.ones(30, dtype=bool))
+    whole = Run(signals, time, nothing, -1.0, time - 1.5, degaussed=degaussed)
+    plays = whole.along(lambda rows: play_values(rows, np.array([0.2, 0.6])))
+    assert not plays[20].any()
+    np.testing.assert_array_equal(plays[20:], play_values(signals[20:], np.array([0.2, 0.6])))
+
+    law = HysteresisModel(np.array([0.0, 0.4]), np.array([[0.7], [0.3]]), np.array([1.5]), 0.1, 0.02, CREEP_TIMES)
+    state, expected = law.demagnetised(3, -1.0), []
+    for row, (shape, when) in enumerate(zip(signals, time, strict=True)):
+        if degaussed[row]:
+            state = law.degaussed(state, when - 1.5)
+        state = law.advance(law.move(state, shape, when - 1.5), when)
+        expected.append(law.effective(state))
+    np.testing.assert_allclose(whole.follow(law), expected, atol=1e-12)
+    assert np.abs(expected[20]).max() > 1e-3  # creep of what stood before
 
 
 def test_a_map_of_something_else_does_not_enter_the_law() -> None:

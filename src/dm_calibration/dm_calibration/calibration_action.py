@@ -35,6 +35,7 @@ _PHASES = {
     StepKind.SURFACE: "surfaces",
     StepKind.EXCITATION: "hysteresis",
     StepKind.CHECK: "hysteresis",
+    StepKind.DEGAUSSED: "hysteresis",
 }
 
 #: How long a goal waits for a driver that was started together with this node.

@@ -72,6 +72,19 @@ def test_a_small_mirror_leaves_surfaces_out_or_refuses_them_by_name() -> None:
         make_plan(PlanKind.SURFACES, small, PlanOptions(surfaces=("p25",)))
 
 
+def test_moves_in_use_follow_a_degauss_with_a_map_at_rest() -> None:
+    """Every part of a run has them, one halfway too: what all requests begin with is among what the bound is from."""
+    plan = make_plan(PlanKind.HYSTERESIS, make_mirror(rings=1), PlanOptions(hysteresis_maps=140, until=2e-9))
+    kinds = [step.kind for step in plan.steps]
+    degausses = [number for number, kind in enumerate(kinds) if kind is StepKind.DEGAUSS][1:]
+    assert len(degausses) == 2 * (len(plan.ends) + 1)
+    for number in degausses:
+        at_rest = plan.steps[number + 1]
+        assert at_rest.kind is StepKind.DEGAUSSED and at_rest.signals is not None and not at_rest.signals.any()
+        assert kinds[number + 2] is StepKind.CHECK
+    assert len({step.label for step in plan.steps}) == len(plan.steps)
+
+
 def test_checks_lie_where_the_mirror_is_used() -> None:
     """About the shape that flattens it; all over the range of one that is flat at an end of it, as a membrane."""
     bench = SteadyMirror()

@@ -51,6 +51,25 @@ def test_all_steps_are_measured_in_order(bench: LinearBench, mirror: Mirror) -> 
     assert record.stamp_ns == bench.maps[1].stamp_ns == round(2.5e9)
 
 
+def test_degausses_in_the_course_of_a_run_begin_no_new_one(bench: LinearBench, mirror: Mirror) -> None:
+    """Where a map after one fails the history knows of it all the same; one that was interrupted is made again."""
+    bench.failing = {"degaussed 160": 9}
+    plan = make_plan(PlanKind.HYSTERESIS, mirror)
+    outcome = run(bench, mirror, PlanKind.HYSTERESIS).outcome
+    assert [move.degauss for move in bench.moves].count(True) == 3
+    maps = outcome.maps()
+    assert maps.label == tuple(step.label for step in plan.steps if step.kind is not StepKind.DEGAUSS)
+    first, second = np.flatnonzero(maps.degaussed)
+    assert not np.isfinite(maps.coefficients[first]).any() and np.isfinite(maps.coefficients[second]).all()
+    assert not maps.segment.any()
+    assert (maps.moved_s()[[first, second]] == 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])[[first - 1, second - 1]]).all()
+
+    del outcome.records[second:], outcome.centres[second:]
+    again = Procedure(plan, mirror, bench, outcome=outcome).run()
+    assert [move.degauss for move in bench.moves].count(True) == 5  # as a run goes on, and its own
+    assert again.maps().degaussed.sum() == 2
+
+
 def test_a_failed_measurement_is_tried_again(bench: LinearBench, mirror: Mirror) -> None:
     bench.failing = {"poke+03": 2}
     outcome = run(bench, mirror, measure_retries=2).outcome

@@ -34,6 +34,7 @@ class Run:
         start: s, when the degauss had ended; None = just before the first map.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
+        degaussed: (M,) before which maps, at mid range, the mirror was degaussed in its course; None = none.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -45,6 +46,7 @@ class Run:
     start: float | None = None
     moved: Floats | None = None
     segment: NDArray[np.int64] | None = None
+    degaussed: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if (np.diff(self.time) < 0.0).any():
@@ -65,14 +67,22 @@ class Run:
 
     def along(self, feature: Callable[[Floats], Floats]) -> Floats:
         """A `feature` of signals that begin demagnetised, along the commands."""
-        return np.concatenate([feature(self.signals[rows]) for rows, _ in self.parts])
+        return np.concatenate([feature(self.signals[rows]) for part, _ in self.parts for rows in self._sequences(part)])
+
+    def _sequences(self, part: slice) -> list[slice]:
+        """The rows of a part from one degauss to the next."""
+        again = [] if self.degaussed is None else part.start + 1 + np.flatnonzero(self.degaussed[part][1:])
+        return [slice(*bounds) for bounds in pairwise((part.start, *again, part.stop))]
 
     def follow(self, law: HysteresisModel) -> Floats:
         """(M, N) effective signals."""
         followed = []
-        for rows, start in self.parts:
-            rested = law.demagnetised(self.signals.shape[1], start)
-            followed.append(follow(law, rested, self.signals[rows], self.time[rows], self._moved(rows))[0])
+        for part, start in self.parts:
+            state = law.demagnetised(self.signals.shape[1], start)
+            for rows in self._sequences(part):
+                state = law.degaussed(state, state.time if self.moved is None else float(self.moved[rows.start]))
+                effective, state = follow(law, state, self.signals[rows], self.time[rows], self._moved(rows))
+                followed.append(effective)
         return np.concatenate(followed)
 
     def creep_states(self, values: Floats) -> Floats:
@@ -130,7 +140,7 @@ def run_of(maps: MapSet) -> Run:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    return Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
+    return Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment, maps.degaussed)
 
 
 def basis_of(columns: Floats) -> Floats:

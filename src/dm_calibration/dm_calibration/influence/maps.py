@@ -19,7 +19,9 @@ POKE = "poke"
 SURFACE = "surface"
 EXCITATION = "excitation"
 CHECK = "check"
-KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, CHECK)
+#: At rest, after a degauss in the course of a run.
+DEGAUSSED = "degaussed"
+KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, CHECK, DEGAUSSED)
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 3
 
@@ -91,12 +93,19 @@ class MapSet:
         """(M,) which maps are reference frames."""
         return np.array([kind == REFERENCE for kind in self.kind], dtype=bool)
 
+    @property
+    def degaussed(self) -> NDArray[np.bool_]:
+        """(M,) before which maps the mirror was degaussed in the course of the run."""
+        return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool)
+
     def moved_s(self) -> Floats:
-        """(M,) s since the first map: when the mirror took each shape; right after the map before where not known."""
+        """(M,) s since the first map: when the mirror took each shape; right after the map before where not known, and
+        after a degauss, while which creep follows the middle of its swings.
+        """
         before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
         before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before
-        plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
+        plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns) & ~self.degaussed
         plausible[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
         return np.asarray(1e-9 * (np.where(plausible, self.moved_ns, before) - self.stamp_ns[0]))
 

@@ -94,7 +94,8 @@ def forecast(
     if earlier is not None:
         noise = math.sqrt(earlier.maps.noise_variance().mean()) or TYPICAL_NOISE
     law = left_of_one_map(earlier, mirror)
-    parts = [*(end - 1 for end in sorted(plan.ends)), len(steps)]  # the degauss is no step here
+    measured = np.cumsum([step.kind is not StepKind.DEGAUSS for step in plan.steps])
+    parts = [*(int(measured[end - 1]) for end in sorted(plan.ends)), len(steps)]
     expected = Forecast(duration, 0.0)
     for part in parts:
         try:

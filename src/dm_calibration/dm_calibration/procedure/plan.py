@@ -1,4 +1,4 @@
-"""What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1."""
+"""What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1, hysteresis."""
 
 import math
 from collections.abc import Sequence
@@ -46,11 +46,12 @@ class StepKind(Enum):
     SURFACE = "surface"
     EXCITATION = "excitation"
     CHECK = "check"
+    DEGAUSSED = "degaussed"
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a plan.
+    """One step of a plan. A degauss is followed by a map of the mirror at rest.
 
     Attributes:
         label: unique in the plan.
@@ -126,7 +127,7 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
 
 
 def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
-    """A degauss, repeated maps at rest, and the excitation.
+    """A degauss, repeated maps at rest, and the excitation with its degausses, a map at rest after each.
 
     Raises:
         ValueError: a run that would not begin with a degauss, or of too few or too many maps.
@@ -141,7 +142,11 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     for part in parts:
         if count:
             ends.add(len(steps))
-        for signals, dwell, share, check in zip(part.signals, part.dwell, part.settle_share, part.check, strict=True):
+        commands = zip(part.signals, part.dwell, part.settle_share, part.check, strict=True)
+        for row, (signals, dwell, share, check) in enumerate(commands):
+            if row in part.degaussed:
+                steps.append(Step(f"degauss {count}", StepKind.DEGAUSS))
+                steps.append(Step(f"degaussed {count}", StepKind.DEGAUSSED, mirror.rest))
             count += 1
             kind = StepKind.CHECK if check else StepKind.EXCITATION
             steps.append(Step(f"{kind.value} {count}", kind, signals, dwell=float(dwell), settle_share=float(share)))

@@ -102,7 +102,7 @@ class Procedure:
 
     def _is_done(self, number: int, step: Step) -> bool:
         if step.kind is StepKind.DEGAUSS:
-            return bool(self.outcome.records)
+            return self._is_done(number + 1, self._plan.steps[number + 1])
         return self.outcome.tried(number) >= self._options.maps_per_state
 
     def _do(self, planned: Step, number: int) -> None:
@@ -110,7 +110,8 @@ class Procedure:
         self._report(planned.label, planned.kind, number)
         if planned.kind is StepKind.DEGAUSS:
             self._bench.degauss()
-            self._note(Segment(0, time.time_ns()))
+            if not self.outcome.records:
+                self._note(Segment(0, time.time_ns()))
         elif (step := self._solved(planned, number)) is not None:
             self._measure_state(step, number, self._options.maps_per_state)
 
@@ -197,7 +198,7 @@ class Procedure:
         Its time is not known; it counts as right after the map before.
         """
         records = self.outcome.records
-        if step.kind not in (StepKind.EXCITATION, StepKind.CHECK) or not records:
+        if step.kind not in (StepKind.EXCITATION, StepKind.CHECK, StepKind.DEGAUSSED) or not records:
             return
         nothing = np.full_like(records[-1].coefficients, np.nan)
         assert step.signals is not None

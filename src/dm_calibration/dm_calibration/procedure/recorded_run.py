@@ -140,7 +140,7 @@ def _difference(plan: Plan, moves: Sequence[Move]) -> str:
     for step, move in zip(plan.steps[:end], moves, strict=False):
         if step.kind is StepKind.DEGAUSS:
             if not move.degauss:
-                return "the recorded run does not begin with a degauss"
+                return f"step {step.label!r}: no degauss was recorded"
         elif step.signals is not None and not step.needs_model and not np.array_equal(move.requested, step.signals):
             return f"step {step.label!r}: other signals were commanded"
     return f"step {plan.steps[len(moves)].label!r}: the recording ends before it" if len(moves) < end else ""

@@ -24,7 +24,7 @@ NM, MM = 1e9, 1e3
 PIXELS = 61
 #: Small maps in a row.
 COLUMNS = 7
-KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, PURPLE), strict=True))
+KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, PURPLE, VERMILION), strict=True))
 
 
 def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:
