@@ -3,11 +3,9 @@
 The latest command wins. A move is cut into steps by the safety limiter and written by `dm_driver.writer_thread`.
 """
 
-import math
 import time
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_driver.degauss import degauss_move
 from dm_driver.moves import Kind, Move, Outcome
 from dm_driver.safety_limiter import Shape, largest_change
 from dm_driver.writer_thread import WriterThread
@@ -39,7 +37,7 @@ class ActuatorWriter(WriterThread):
             self._sequence = 0
             self._queue.forget_history()
             if known is not None and largest_change(known, self._safe_shape) > 0.0:
-                move = Move(Kind.SAFE, [self._safe_shape], self._safe_shape)
+                move = Move(Kind.SAFE, self._safe_shape)
                 self._put(move)
             self._change.notify_all()
             written = self._change.wait_for(lambda: not self._rewrite_due, timeout_s)
@@ -62,7 +60,7 @@ class ActuatorWriter(WriterThread):
             self._accepting = False
             if not self._enabled:
                 return Outcome.REACHED
-            move = Move(Kind.SAFE, [self._safe_shape], self._safe_shape)
+            move = Move(Kind.SAFE, self._safe_shape)
             if self._link_up:
                 self._put(move)
             else:
@@ -81,7 +79,24 @@ class ActuatorWriter(WriterThread):
         Raises:
             Refusal: DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
         """
-        return self._submit(Move(Kind.COMMAND, [shape], shape))
+        return self.submit(Move(Kind.COMMAND, shape))
+
+    def submit(self, move: Move) -> Move:
+        """Begin `move`, a legal way such as `degauss_move` makes; the one under way is left for it. Returns it.
+
+        Raises:
+            Refusal: DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
+        """
+        with self._change:
+            if not self._accepting or self._stopping:
+                raise Refusal(ErrorCode.DRIVER_INACTIVE, "the driver is not active: activate it first")
+            if not self._link_up:
+                raise Refusal(
+                    ErrorCode.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}"
+                )
+            self._watchdog.feed(time.monotonic())
+            self._put(move)
+            return move
 
     def correct(self, shape: Shape, turns: int) -> Move | None:
         """As `command`, but only while the mirror rests after so many `turns`.
@@ -94,28 +109,12 @@ class ActuatorWriter(WriterThread):
                 return None
             return self.command(shape)
 
-    def degauss(
-        self, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf, name: str = "steps"
-    ) -> Move:
-        """Run the decaying cycle about mid range, then go to `end` (checked, as for `command`).
-
-        Args:
-            amplitude: first half-swing; 0 = the largest inside the limits.
-            steps: half-swings.
-            duration_max: s, longest time that it may take.
-            name: of what gave `steps`, for the refusal.
-
-        Raises:
-            Refusal: OUT_OF_RANGE, DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
-        """
-        return self._submit(degauss_move(self._limiter.limits, amplitude, steps, end, duration_max, name))
-
     def turn_back(self, move: Move) -> Move | None:
         """Leave `move` for the shape that was requested before it; None = something else was asked for since."""
         with self._change:
             if self._queue.newest is not move or move.before is None:
                 return None
-            back = Move(Kind.COMMAND, [move.before], move.before)
+            back = Move(Kind.COMMAND, move.before)
             self._watchdog.feed(time.monotonic())
             self._put(back)
             return back
@@ -125,15 +124,3 @@ class ActuatorWriter(WriterThread):
         with self._change:
             shape = self._shape if self._written is not None else None
         return self._limiter.ramp_time(shape, target) if shape is not None else 0.0
-
-    def _submit(self, move: Move) -> Move:
-        with self._change:
-            if not self._accepting or self._stopping:
-                raise Refusal(ErrorCode.DRIVER_INACTIVE, "the driver is not active: activate it first")
-            if not self._link_up:
-                raise Refusal(
-                    ErrorCode.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}"
-                )
-            self._watchdog.feed(time.monotonic())
-            self._put(move)
-            return move

@@ -71,4 +71,4 @@ def degauss_move(
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
     # A smaller cycle leaves what wider swings have written.
-    return Move(Kind.DEGAUSS, waypoints, end, wipes=swing >= FULL_CYCLE * largest, steps=steps, duration=duration)
+    return Move(Kind.DEGAUSS, end, waypoints, wipes=swing >= FULL_CYCLE * largest, steps=steps, duration=duration)

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -28,13 +28,14 @@ class Outcome(Enum):
     STOPPED = "abandoned: the driver stopped"
 
 
+@dataclass(eq=False)
 class Move:
     """A way through legal shapes; its end can be waited for.
 
     Attributes:
         kind: what it is for.
-        waypoints: shapes to pass; straight lines between them.
-        target: the last of them.
+        target: (N,) where it ends.
+        waypoints: shapes to pass, the target last; straight lines between them. None = straight to the target.
         wipes: a degauss over the full range, which wipes the hysteresis.
         steps, duration: of a degauss: its half-swings, and how long they take, s.
         begun: waypoints that the mirror is past, or on its way to.
@@ -42,28 +43,20 @@ class Move:
             it would have turned back to; None before the first.
     """
 
-    def __init__(
-        self,
-        kind: Kind,
-        waypoints: Iterable[Shape],
-        target: Shape,
-        wipes: bool = False,
-        steps: int = 0,
-        duration: float = 0.0,
-    ) -> None:
-        self.kind = kind
-        self.wipes = wipes
-        self.waypoints = waypoints
-        self.target = target
-        self.steps, self.duration = steps, duration
-        self.begun = 0
-        self.before: Shape | None = None
-        self._ended = threading.Event()
-        self._outcome: Outcome | None = None
+    kind: Kind
+    target: Shape
+    waypoints: Iterable[Shape] | None = None
+    wipes: bool = False
+    steps: int = 0
+    duration: float = 0.0
+    begun: int = field(default=0, init=False)
+    before: Shape | None = field(default=None, init=False)
+    _ended: threading.Event = field(default_factory=threading.Event, init=False)
+    _outcome: Outcome | None = field(default=None, init=False)
 
     def way(self) -> Iterator[Shape]:
         """The waypoints, counted as they are begun."""
-        for waypoint in self.waypoints:
+        for waypoint in (self.target,) if self.waypoints is None else self.waypoints:
             self.begun += 1
             yield waypoint
 

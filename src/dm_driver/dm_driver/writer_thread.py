@@ -144,7 +144,7 @@ class WriterThread:
                         self._begin(queue.pending)
                         queue.pending = None
                     elif self._watchdog.expired(now) and not busy:
-                        self._begin(Move(Kind.SAFE, [self._safe_shape], self._safe_shape))
+                        self._begin(Move(Kind.SAFE, self._safe_shape))
                     due, action = (
                         (self._write_at, self._step) if queue.current is not None else (self._check_at, self._check)
                     )

@@ -13,8 +13,9 @@ import pytest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.degauss import degauss_move
 from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
-from dm_driver.moves import Kind, Outcome, WriterState
+from dm_driver.moves import Kind, Move, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import TABLES, wiring_table
@@ -34,6 +35,10 @@ def unit() -> Iterator[Edac40TcpUnit]:
         yield server
 
 
+def limits(slew_rate: float) -> DriverLimits:
+    return DriverLimits(-1, 1, PAIRS, 1.0, actuators=37, step=0.1, slew_rate=slew_rate)
+
+
 @contextmanager
 def running_writer(
     unit: Edac40TcpUnit, slew_rate: float = 1000.0, electronics: type[Edac40Tcp] = Edac40Tcp, **arguments: Any
@@ -42,7 +47,7 @@ def running_writer(
     writer = ActuatorWriter(
         electronics(ElectronicsSettings("127.0.0.1", unit.port, timeout_s=0.5)),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
-        SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37, step=0.1, slew_rate=slew_rate)),
+        SafetyLimiter(limits(slew_rate)),
         np.full(37, -1.0),
         listener=lambda state, edge: told.append((state, edge)),
         **arguments,
@@ -64,6 +69,10 @@ def signals_of(frames: list[Frame]) -> np.ndarray:
 
 def shape(value: float) -> np.ndarray:
     return np.full(37, value)
+
+
+def degauss(writer: ActuatorWriter, amplitude: float, steps: int, end: np.ndarray) -> Move:
+    return writer.submit(degauss_move(limits(writer._limiter.limits.slew_rate), amplitude, steps, end))
 
 
 def refused(action: Callable[[], Any]) -> int:
@@ -142,9 +151,9 @@ def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -
         move = writer.command(shape(0.5))
         assert writer.correct(shape(-0.48), turns + 1) is None  # decided before the move began
         assert move.wait(5) is Outcome.REACHED
-        degauss = writer.degauss(0.0, 6, shape(0.0))
+        cycle = degauss(writer, 0.0, 6, shape(0.0))
         assert writer.correct(shape(0.49), turns + 2) is None
-        assert degauss.wait(20) is Outcome.REACHED
+        assert cycle.wait(20) is Outcome.REACHED
         assert writer.counters.overtaken == 3
         assert writer.state().requested == pytest.approx(shape(0.0))
 
@@ -160,7 +169,7 @@ def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac
             except Refusal as refusal:
                 assert refusal.error_code is ErrorCode.NEIGHBOUR_DIFFERENCE
             if number == 30:
-                writer.degauss(0.0, 6, shape(0.0))
+                degauss(writer, 0.0, 6, shape(0.0))
             time.sleep(generator.uniform(0, 0.01))
         assert last is not None and last.wait(5) is Outcome.REACHED
         wait_until(lambda: len(unit.frames) == writer.state().sequence)
@@ -176,12 +185,10 @@ def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac
 def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
     with running_writer(unit) as (writer, _told):
         assert not writer.state().history_known
-        move = writer.degauss(0.5, 10, shape(0.2))
+        move = degauss(writer, 0.5, 10, shape(0.2))
         assert move.wait(10) is Outcome.REACHED
         assert not writer.state().history_known  # wider swings than 0.5 are still remembered
         wait_until(lambda: len(unit.frames) == writer.state().sequence)
-        for bad in (lambda: writer.degauss(1.01, 10, shape(0)), lambda: writer.degauss(0.5, 0, shape(0))):
-            assert refused(bad) is ErrorCode.OUT_OF_RANGE
     one = signals_of(unit.frames)
     assert np.ptp(one, axis=1).max() <= CODE  # all together
     level = one[1:-1, 0]
@@ -193,7 +200,7 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
 
 def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=1e4) as (writer, _told):
-        assert writer.degauss(0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
+        assert degauss(writer, 0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
         assert writer.state().history_known and writer.state().degausses == 1
         assert writer.command(shape(0.25)).wait(5) is Outcome.REACHED
         assert writer.state().history_known
@@ -225,8 +232,8 @@ def test_a_move_of_one_step_that_takes_over_hides_no_turn(unit: Edac40TcpUnit) -
 
 def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=40.0) as (writer, _told):
-        assert writer.degauss(0.1, 2, shape(0.0)).wait(5) is Outcome.REACHED
-        move = writer.degauss(0.0, 100, shape(0.0))
+        assert degauss(writer, 0.1, 2, shape(0.0)).wait(5) is Outcome.REACHED
+        move = degauss(writer, 0.0, 100, shape(0.0))
         wait_until(lambda: writer.state().moving is Kind.DEGAUSS and not writer.state().history_known)
         command = writer.command(shape(0.3))
         assert move.wait(5) is Outcome.SUPERSEDED
@@ -247,40 +254,43 @@ def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
 def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=20.0) as (writer, _told):
         assert writer.command(shape(0.3)).wait(5) is Outcome.REACHED
-        move = writer.degauss(0.0, 100, shape(0.0))
+        move = degauss(writer, 0.0, 100, shape(0.0))
         wait_until(lambda: move.begun > 2)
         back = writer.turn_back(move)
         assert back is not None and back.wait(5) is Outcome.REACHED
         wait_until(lambda: np.allclose(signals_of(unit.frames)[-1], 0.3, atol=CODE))
         assert not writer.state().history_known
-        first = writer.degauss(0.0, 100, shape(0.0))
+        first = degauss(writer, 0.0, 100, shape(0.0))
         wait_until(lambda: first.begun > 2)
-        back = writer.turn_back(writer.degauss(0.0, 100, shape(0.1)))
+        back = writer.turn_back(degauss(writer, 0.0, 100, shape(0.1)))
         assert back is not None and back.target == pytest.approx(shape(0.3))  # no degauss has ended
         assert back.wait(5) is Outcome.REACHED
-        move = writer.degauss(0.0, 100, shape(0.0))
+        move = degauss(writer, 0.0, 100, shape(0.0))
         newer = writer.command(shape(-0.2))
         assert writer.turn_back(move) is None and newer.wait(5) is Outcome.REACHED
 
 
-def test_a_degauss_is_bounded(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=20.0) as (writer, _told):
-        with pytest.raises(
-            Refusal, match=r"steps = 9000: would take 450 s at limits.slew_rate = 20 1/s, must be at most 180 s"
-        ) as caught:
-            writer.degauss(0.0, 9000, shape(0.0), duration_max=180.0)
-        assert caught.value.error_code == ErrorCode.OUT_OF_RANGE
-        assert refused(lambda: writer.degauss(1e-4, 100_000, shape(0.0))) == ErrorCode.OUT_OF_RANGE
+def test_a_degauss_is_bounded() -> None:
+    with pytest.raises(
+        Refusal, match=r"steps = 9000: would take 450 s at limits.slew_rate = 20 1/s, must be at most 180 s"
+    ) as caught:
+        degauss_move(limits(20.0), 0.0, 9000, shape(0.0), duration_max=180.0)
+    assert caught.value.error_code == ErrorCode.OUT_OF_RANGE
+
+
+@pytest.mark.parametrize(("amplitude", "steps"), [(1.01, 10), (0.5, 0), (1e-4, 100_000)])
+def test_an_impossible_degauss_is_refused(amplitude: float, steps: int) -> None:
+    assert refused(lambda: degauss_move(limits(20.0), amplitude, steps, shape(0.0))) is ErrorCode.OUT_OF_RANGE
 
 
 def test_a_degauss_longer_than_the_watchdog_is_finished(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=40.0, watchdog_s=0.1) as (writer, _told):
-        assert writer.degauss(0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
+        assert degauss(writer, 0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
 
 
 def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=4.0) as (writer, told):
-        writer.degauss(0.05, 1, shape(-0.9)).wait(5)
+        degauss(writer, 0.05, 1, shape(-0.9)).wait(5)
         move = writer.command(shape(0.6))
         wait_until(lambda: writer.state().sequence > 15)
         unit.unplug()

@@ -43,7 +43,7 @@ def carried_out(
 
     def begin(_goal: Any) -> Any:
         writer.begun = handle.is_cancel_requested = True
-        return writer, Move(Kind.DEGAUSS, [], none)
+        return writer, Move(Kind.DEGAUSS, none)
 
     monkeypatch.setattr(action, "_begin", begin)
     return action._carry_out(handle)

@@ -33,20 +33,20 @@ class DegaussAction:
         self._gate, self._values = gate, values
         self._server = WorkerActionServer(node, Degauss, "degauss", self._run, exclusive="preempt", admit=self._admit)
 
-    def _cycle(self, goal: Any, configuration: DriverConfiguration) -> tuple[Any, ...]:
-        """Arguments of `ActuatorWriter.degauss` for a goal."""
+    def _move(self, goal: Any, configuration: DriverConfiguration) -> Move:
+        """The move that a goal asks for. Raises Refusal where it may not be."""
         limits = configuration.limiter.limits
         middle = np.full(limits.actuators, limits.middle)
         end = configuration.limiter.check_shape(goal.end_signals or middle, "end_signals")
         name = "steps" if goal.steps else "degauss.steps"
         steps = goal.steps or self._values["degauss.steps"]
-        return goal.amplitude, steps, end, self._values["degauss.duration_max"], name
+        return degauss_move(limits, goal.amplitude, steps, end, self._values["degauss.duration_max"], name)
 
     def _admit(self, goal: Any) -> None:
         """Raise the Refusal, which the gate logs, of a goal that may not be: it must not end the one that runs."""
 
         def judge(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
-            degauss_move(configuration.limiter.limits, *self._cycle(goal, configuration))
+            self._move(goal, configuration)
 
         if isinstance(refusal := self._gate.attempt("degauss", goal, judge), Refusal):
             raise refusal
@@ -55,7 +55,7 @@ class DegaussAction:
         """The move of a goal, which has begun; or its refusal: things may have changed since it was admitted."""
 
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> tuple[ActuatorWriter, Move]:
-            return writer, writer.degauss(*self._cycle(goal, configuration))
+            return writer, writer.submit(self._move(goal, configuration))
 
         return self._gate.attempt("degauss", goal, carry_out)
 
