@@ -50,9 +50,13 @@ class ActuatorWriter(WriterThread):
     def _known_shape(self) -> Shape | None:
         """Where the outputs stand, as far as anybody can know; None = unknown."""
         with self._change:
-            if self._written is not None:
+            if self._applied is not None:
                 return self._shape
-        return self._port.recorded_shape()
+        recorded = self._last.load()
+        try:
+            return None if recorded is None else self._limiter.check_shape(recorded)
+        except Refusal:  # the limits have changed: no legal way begins there
+            return None
 
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on."""
@@ -122,5 +126,5 @@ class ActuatorWriter(WriterThread):
     def ramp_time(self, target: Shape) -> float:
         """Seconds that the slew limit needs from the present shape to `target`; 0 before the first write."""
         with self._change:
-            shape = self._shape if self._written is not None else None
+            shape = self._shape if self._applied is not None else None
         return self._limiter.ramp_time(shape, target) if shape is not None else 0.0

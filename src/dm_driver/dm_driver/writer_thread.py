@@ -9,16 +9,21 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dm_driver.electronics.base import DriveElectronics, ElectronicsError
 from dm_driver.last_shape import LastShape
 from dm_driver.move_queue import MoveQueue
 from dm_driver.moves import Counters, Kind, Move, Outcome, WriterState
-from dm_driver.output.output_port import OutputPort, Written
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog
 
 RECONNECT_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
+#: A link that opened counts as standing when it still does after this time: a busy EDAC40 accepts a second TCP client
+#: only to close it, and a datagram's "port unreachable" takes a moment to return.
+CONFIRM_S = 0.05
 
 Listener = Callable[[WriterState, bool], None]
 
@@ -54,8 +59,11 @@ class WriterThread:
         self._safe_shape = limiter.check_shape(safe_shape, "safe_signals")
         self._listener = listener
         self._watchdog = Watchdog(watchdog_s)
-        record = last if last is not None else LastShape(None, limiter.limits.actuators)
-        self._port = OutputPort(electronics, output, limiter, stamp_ns, record)
+        self._electronics = electronics
+        self._output = output
+        self._stamp_ns = stamp_ns
+        self._last = last if last is not None else LastShape(None, limiter.limits.actuators)
+        self._recording = True
         self._thread = threading.Thread(target=self._run, name="actuator_writer", daemon=True)
         # Everything below is guarded by this condition; it is notified at every change.
         self._change = threading.Condition()
@@ -68,7 +76,9 @@ class WriterThread:
         self._rewrite_due = False
         self._queue = MoveQueue(limiter)
         self._shape: Shape | None = None  # before quantisation; ramps start here, so that rounding cannot add up
-        self._written: Written | None = None
+        self._applied: Shape | None = None  # what a write has left at the actuators; None before the first
+        self._volts: NDArray[np.float64] | None = None
+        self._written_ns = 0
         self._sequence = self._turns_published = 0
         self._write_at = 0.0
         self._check_at = 0.0
@@ -94,7 +104,22 @@ class WriterThread:
     def state(self) -> WriterState:
         """The present state."""
         with self._change:
-            return self._state()
+            queue = self._queue
+            return WriterState(
+                link_up=self._link_up,
+                enabled=self._enabled,
+                moving=queue.newest.kind if queue.newest is not None else None,
+                requested=queue.requested if self._applied is not None else None,
+                applied=self._applied,
+                volts=self._volts,
+                stamp_ns=self._written_ns,
+                sequence=self._sequence,
+                history_known=queue.history_known,
+                degausses=queue.degausses,
+                turns=queue.turns,
+                turned_at=queue.turned_at,
+                fault=self._fault,
+            )
 
     # Guarded by the condition
 
@@ -105,28 +130,6 @@ class WriterThread:
     def _begin(self, move: Move) -> None:
         assert self._shape is not None
         self._queue.begin(move, self._shape, self._applied)
-
-    @property
-    def _applied(self) -> Shape | None:
-        return self._written.applied if self._written is not None else None
-
-    def _state(self) -> WriterState:
-        written, queue = self._written, self._queue
-        return WriterState(
-            link_up=self._link_up,
-            enabled=self._enabled,
-            moving=queue.newest.kind if queue.newest is not None else None,
-            requested=queue.requested if written is not None else None,
-            applied=written.applied if written is not None else None,
-            volts=written.volts if written is not None else None,
-            stamp_ns=written.stamp_ns if written is not None else 0,
-            sequence=self._sequence,
-            history_known=queue.history_known,
-            degausses=queue.degausses,
-            turns=queue.turns,
-            turned_at=queue.turned_at,
-            fault=self._fault,
-        )
 
     def _next_action(self) -> Callable[[], None] | None:
         """Wait for something to do; None = stop."""
@@ -167,7 +170,8 @@ class WriterThread:
                     logging.getLogger(__name__).exception("the actuator writer failed; it will reconnect")
                     self._lose_link(f"internal error: {type(error).__name__}: {error}")
         finally:
-            self._port.close()
+            self._electronics.close()
+            self._last.close()
             with self._change:
                 self._queue.end_all(Outcome.STOPPED, self._shape)
                 self._link_up = False
@@ -176,10 +180,11 @@ class WriterThread:
 
     def _connect(self) -> None:
         self._retry_at = time.monotonic() + RECONNECT_PERIOD_S
-        self._port.electronics.open()
+        self._electronics.open()
         if self._rewrite_due:
             self._rewrite()
-        self._port.confirm()
+        time.sleep(CONFIRM_S)
+        self._electronics.check()
         with self._change:
             self._link_up = True
             self.counters.reconnects += self._was_up
@@ -221,24 +226,44 @@ class WriterThread:
             move.finish(Outcome.REACHED)
 
     def _write(self, previous: Shape | None, shape: Shape) -> None:
-        written = self._port.write(previous, shape)
+        """Write `shape` (N,) over `previous`; None = the outputs are unknown, so that no step can be judged.
+
+        Raises:
+            Refusal: not a legal shape or step; nothing was sent.
+            ElectronicsError: the unit did not take it.
+        """
+        self._limiter.check_write(previous, shape)
+        self._record(shape)
+        codes = self._output.codes(shape)
+        self._electronics.write(codes, self._output.wired)
+        written_ns, now = self._stamp_ns(), time.monotonic()
         with self._change:
             self._shape = shape
-            self._written = written
+            self._applied, self._volts = self._output.outcome(codes)
+            self._written_ns = written_ns
             self._sequence += 1
             self._rewrite_due = False
             pause = self._limiter.pause_after(previous, shape) if previous is not None else 0.0
-            self._write_at = written.at + pause
-            self._check_at = written.at + CHECK_PERIOD_S
+            self._write_at = now + pause
+            self._check_at = now + CHECK_PERIOD_S
             self._change.notify_all()
         self.counters.frames += 1
 
+    def _record(self, shape: Shape) -> None:
+        try:
+            self._last.note(shape)
+            self._recording = True
+        except OSError as error:  # a full disk must not stop the mirror
+            if self._recording:
+                logging.getLogger(__name__).warning("the last shape cannot be recorded: %s", error)
+            self._recording = False
+
     def _check(self) -> None:
         self._check_at = time.monotonic() + CHECK_PERIOD_S
-        self._port.electronics.check()
+        self._electronics.check()
 
     def _lose_link(self, reason: str) -> None:
-        self._port.electronics.close()
+        self._electronics.close()
         with self._change:
             lost = self._link_up
             changed = lost or reason != self._fault
