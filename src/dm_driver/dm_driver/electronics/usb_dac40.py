@@ -26,19 +26,8 @@ CHANNEL_ORDER: Final[NDArray[np.intp]] = np.array(
 )
 _CHIP_BIT: Final = (1 << np.arange(_CHIPS)).astype(np.uint8)
 _BIT_SHIFT: Final = np.arange(_BITS - 1, -1, -1, dtype=np.uint16)
-
-
-def _empty_frame() -> NDArray[np.uint8]:
-    """The frame with start byte and group addresses, all data bits 0."""
-    frame = np.zeros(FRAME_LENGTH, dtype=np.uint8)
-    frame[0] = 0xFF
-    for group in range(_GROUPS):
-        for position, bit in enumerate((2, 1, 0)):
-            frame[1 + _GROUP_LENGTH * group + 1 + position] = 0x1F if group >> bit & 1 else 0x00
-    return frame
-
-
-_EMPTY_FRAME: Final = _empty_frame()
+#: Each group begins with a zero byte and its address, three bits from the most significant on.
+_ADDRESSES: Final = np.where(np.arange(_GROUPS)[:, None] >> np.array([2, 1, 0]) & 1, 0x1F, 0x00).astype(np.uint8)
 
 
 def encode_frame(codes: NDArray[np.uint16]) -> bytes:
@@ -49,8 +38,11 @@ def encode_frame(codes: NDArray[np.uint16]) -> bytes:
     """
     chips = codes[CHANNEL_ORDER].reshape(_GROUPS, 1, _CHIPS)
     bits = (chips >> _BIT_SHIFT[:, None] & 1).astype(np.uint8)  # group, bit from the most significant, chip
-    frame = _EMPTY_FRAME.copy()
-    frame[1:-1].reshape(_GROUPS, _GROUP_LENGTH)[:, -_BITS:] = bits @ _CHIP_BIT
+    frame = np.zeros(FRAME_LENGTH, dtype=np.uint8)
+    frame[0] = 0xFF
+    groups = frame[1:-1].reshape(_GROUPS, _GROUP_LENGTH)
+    groups[:, 1:4] = _ADDRESSES
+    groups[:, 4:] = bits @ _CHIP_BIT
     return frame.tobytes()
 
 

@@ -11,7 +11,7 @@ CUSTOM: Final = "custom"
 #: In a custom list: no channel drives this actuator.
 NOT_WIRED: Final = -1
 
-#: Connector channels, 0-based, of actuators 1, 2, 3, ...
+#: Connector channels, 0-based, of actuators 1, 2, 3, ...; channels 0 and 20 are connected by none of these cables.
 TABLES: Final[dict[str, tuple[int, ...]]] = {
     "trihex": (
         *(14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6),
@@ -26,9 +26,6 @@ TABLES: Final[dict[str, tuple[int, ...]]] = {
         *(8, 16, 18, 15, 13, 11, 30, 32, 37, 33, 27, 21, 24, 26, 28, 9, 35, 2),
     ),
 }
-
-#: Channels that none of the named tables uses.
-UNUSED_CHANNELS: Final = (0, 20)
 
 
 def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int) -> NDArray[np.intp]:
@@ -65,8 +62,6 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
     for number, channel in enumerate(table, start=1):
         if not lowest <= channel < channels:
             raise ValueError(f"{source}: actuator {number} on channel {channel}; must be {lowest} to {channels - 1}")
-        if name != CUSTOM and channel in UNUSED_CHANNELS:
-            raise ValueError(f"{source}: actuator {number} on channel {channel}, which this cable leaves unconnected")
     counts = Counter(channel for channel in table if channel != NOT_WIRED)
     twice = {channel: count for channel, count in counts.items() if count > 1}
     if twice:
