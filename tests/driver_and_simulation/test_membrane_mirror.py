@@ -103,7 +103,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
     driver_values |= {"electronics.port": bench.endpoints["tcp_port"], "limits.slew_rate": 1e4}
     configuration = build_configuration(driver_values)
     writer = ActuatorWriter(
-        configuration.make_electronics(), configuration.output, configuration.limiter, configuration.safe_shape
+        configuration.electronics, configuration.output, configuration.limiter, configuration.safe_shape
     )
     writer.start()
     assert writer.wait_for_link(10.0) and writer.enable(10.0)

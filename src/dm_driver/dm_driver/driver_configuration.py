@@ -31,8 +31,7 @@ class DriverConfiguration:
         output: wiring and volts.
         safe_shape: (N,) legal signals.
         settings: how the electronics are reached.
-        kind: name of the back end.
-        knows_volts: whether the volts of `output` are volts, see :class:`DriveElectronics`.
+        electronics: the back end, not yet opened.
     """
 
     x: NDArray[np.float64]
@@ -41,12 +40,7 @@ class DriverConfiguration:
     output: OutputStage
     safe_shape: Shape
     settings: ElectronicsSettings
-    kind: str
-    knows_volts: bool
-
-    def make_electronics(self) -> DriveElectronics:
-        """Return a new back end, not yet opened."""
-        return make_electronics(self.kind, self.settings)
+    electronics: DriveElectronics
 
 
 def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
@@ -109,15 +103,15 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     except Refusal as refusal:
         raise ValueError(str(refusal)) from refusal
     doubt = math.floor(limits.step / scale.resolution) if values["electronics.await_arrival"] else 0
+    settings = replace(settings, doubt=doubt)
     return DriverConfiguration(
         x=x,
         y=y,
         limiter=limiter,
         output=OutputStage(scale, channel_of_actuator, back_end.channels),
         safe_shape=safe_shape,
-        settings=replace(settings, doubt=doubt),
-        kind=kind,
-        knows_volts=back_end.knows_volts,
+        settings=settings,
+        electronics=make_electronics(kind, settings),
     )
 
 

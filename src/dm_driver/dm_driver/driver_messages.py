@@ -36,13 +36,9 @@ def unconfigured_message(frame_id: str, refusal: Refusal | None, hold: MirrorHol
     message = ActuatorState(driver_state=ActuatorState.STATE_UNCONFIGURED)
     message.header.frame_id = frame_id
     message.holder, message.holding = hold.holder, hold.sentence
-    _set_error(message, refusal)
-    return message
-
-
-def _set_error(message: ActuatorState, refusal: Refusal | None) -> None:
     if refusal is not None:
         message.error_code, message.message = refusal.error_code, str(refusal)
+    return message
 
 
 def state_message(
@@ -53,17 +49,14 @@ def state_message(
     hold: MirrorHold,
 ) -> ActuatorState:
     """The state of a configured driver; `refusal` of the last command, None when it was carried out."""
-    message = ActuatorState(driver_state=driver_state(state))
-    message.header.frame_id = frame_id
+    message = unconfigured_message(frame_id, refusal, hold)
+    message.driver_state = driver_state(state)
     message.header.stamp = time_message(state.stamp_ns)
-    message.holder, message.holding = hold.holder, hold.sentence
     message.sequence = state.sequence
     message.moving = state.moving is not None
     message.history_known = state.history_known
     message.degausses, message.turns = state.degausses, state.turns
-    if state.link_up or not state.enabled:
-        _set_error(message, refusal)
-    else:
+    if state.enabled and not state.link_up:
         message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, state.fault
     flags = np.zeros(configuration.limiter.limits.actuators, dtype=np.uint8)
     flags[~configuration.output.connected] |= ActuatorState.FLAG_UNUSED
@@ -72,7 +65,7 @@ def state_message(
     if state.requested is not None and state.applied is not None and state.volts is not None:
         message.requested = doubles(state.requested)
         message.applied = doubles(state.applied)
-        if configuration.knows_volts:
+        if configuration.electronics.knows_volts:
             message.volts = doubles(state.volts)
         if state.turned_at is not None:
             message.turned_at = doubles(state.turned_at)
@@ -92,6 +85,7 @@ def mirror_info_message(
 ) -> MirrorInfo:
     """Geometry and limits, for calibration and control. `now` is a time message."""
     limits, scale = configuration.limiter.limits, configuration.output.scale
+    knows_volts = configuration.electronics.knows_volts
     message = MirrorInfo(
         name=values["mirror.name"],
         serial=values["mirror.serial"],
@@ -106,12 +100,12 @@ def mirror_info_message(
         signal_max=limits.high,
         neighbour_difference_max=limits.neighbour_difference,
         slew_rate_max=limits.slew_rate,
-        volts_min=scale.volts_min if configuration.knows_volts else math.nan,
-        volts_max=scale.volts_max if configuration.knows_volts else math.nan,
+        volts_min=scale.volts_min if knows_volts else math.nan,
+        volts_max=scale.volts_max if knows_volts else math.nan,
         safe_signals=doubles(configuration.safe_shape),
         wiring=values["mirror.wiring"],
         channels=array.array("i", configuration.output.channels.astype(np.int32).tobytes()),
-        electronics=configuration.kind,
+        electronics=values["electronics.kind"],
     )
     message.header.frame_id = frame_id
     message.header.stamp = now

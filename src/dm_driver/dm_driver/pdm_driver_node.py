@@ -76,7 +76,7 @@ class PdmDriverNode(ManagedNode):
         self._gate.configuration = configuration
         self._gate.refusal = None
         self._gate.writer = ActuatorWriter(
-            configuration.make_electronics(),
+            configuration.electronics,
             configuration.output,
             configuration.limiter,
             configuration.safe_shape,
@@ -97,7 +97,8 @@ class PdmDriverNode(ManagedNode):
         """The record of what was last sent to this unit; an empty one where none can be kept."""
         settings, actuators = configuration.settings, configuration.limiter.limits.actuators
         place = settings.serial_port or f"{settings.address}-{settings.port}"
-        path = record_path(self._values["state_folder"], configuration.kind, place, self._values["mirror.serial"])
+        names = self._values["electronics.kind"], place, self._values["mirror.serial"]
+        path = record_path(self._values["state_folder"], *names)
         try:
             return LastShape(path, actuators)
         except OSError as error:

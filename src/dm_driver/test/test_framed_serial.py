@@ -119,7 +119,7 @@ def test_the_driver_names_a_wrong_parameter() -> None:
     values |= {"mirror.serial": "1", "electronics.kind": "framed_serial", "electronics.serial_port": "/dev/ttyUSB0"}
     values |= {"volts.dac_at_zero": 0.0, "volts.dac_at_full": 5.0, "volts.amplifier_gain": 80.0}
     values |= {"volts.min": 0.0, "volts.max": 300.0}
-    assert build_configuration(values).make_electronics().channels == 40
+    assert build_configuration(values).electronics.channels == 40
     with pytest.raises(ValueError, match=r"framed_serial\.terminator = 'CR'"):
         build_configuration(values | {"framed_serial.terminator": "CR"})
     with pytest.raises(ValueError, match=r"actuator 3 on channel 38; must be 0 to 37"):
