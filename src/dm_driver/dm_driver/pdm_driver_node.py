@@ -172,7 +172,12 @@ class PdmDriverNode(ManagedNode):
         result = self._gate.attempt("set_signals", request, carry_out, dry_run=request.dry_run)
         will = "would take" if request.dry_run else "took" if request.wait else "takes"
         response.message = f"the signals keep every limit; the ramp {will} {response.ramp_time:.3f} s"
-        self._answer(response, result, wait=request.wait)
+        if isinstance(result, Refusal):
+            response.error_code, response.message = result.error_code, str(result)
+        elif result is not None and request.wait:
+            outcome = result.wait()
+            if outcome is not None and outcome is not Outcome.REACHED:
+                response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
         writer = self._gate.writer
         if writer is not None and (applied := writer.state().applied) is not None:
             response.applied.frombytes(applied.tobytes())
@@ -197,15 +202,6 @@ class PdmDriverNode(ManagedNode):
         else:
             self.get_logger().warning(text, throttle_duration_sec=1.0)
         self._publish_state()
-
-    @staticmethod
-    def _answer(response: Any, result: Move | Refusal | None, wait: bool) -> None:
-        if isinstance(result, Refusal):
-            response.error_code, response.message = result.error_code, str(result)
-        elif result is not None and wait:
-            outcome = result.wait()
-            if outcome is not None and outcome is not Outcome.REACHED:
-                response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
 
     # State
 

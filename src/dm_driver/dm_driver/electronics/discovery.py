@@ -4,6 +4,8 @@ import re
 import select
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Final
 
@@ -48,9 +50,8 @@ class Probe:
     def ask(self) -> None:
         self._socket.sendto(QUESTION, self._destination)
 
-    def answers(self, timeout_s: float, first_only: bool = False) -> list[Unit]:
-        """Return the units whose answers arrive within `timeout_s`, each once; 0 = those that have arrived."""
-        units: dict[str, Unit] = {}
+    def answers(self, timeout_s: float) -> Iterator[Unit]:
+        """Yield the units whose answers arrive within `timeout_s`; 0 = those that have arrived."""
         end = time.monotonic() + timeout_s
         while select.select([self._socket], [], [], max(0.0, end - time.monotonic()))[0]:
             try:
@@ -59,28 +60,22 @@ class Probe:
                 continue
             unit = parse_reply(reply, sender)
             if unit is not None:
-                units.setdefault(unit.mac, unit)
-                if first_only:
-                    break
-        return list(units.values())
+                yield unit
 
     def answered(self, timeout_s: float) -> bool:
         """Whether an answer is there, or comes within `timeout_s`."""
-        return bool(self.answers(timeout_s, first_only=True))
+        return next(self.answers(timeout_s), None) is not None
 
     def close(self) -> None:
         self._socket.close()
 
 
 def discover(address: str = BROADCAST, port: int = PORT, timeout_s: float = 1.0) -> list[Unit]:
-    """Ask `address` (a broadcast address or one host) and return the units that answer within `timeout_s`.
+    """Ask `address` (a broadcast address or one host) and return the units that answer in `timeout_s`, each once.
 
     Raises:
         OSError: the name is unknown or the network unreachable.
     """
-    probe = Probe(address, port)
-    try:
+    with closing(Probe(address, port)) as probe:
         probe.ask()
-        return probe.answers(timeout_s)
-    finally:
-        probe.close()
+        return list({unit.mac: unit for unit in probe.answers(timeout_s)}.values())
