@@ -7,6 +7,7 @@ vendors state hysteresis.
 """
 
 import copy
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -123,61 +124,54 @@ class MixedHysteresis:
         return np.sum([weight * law.move(u) for weight, law in self._parts], axis=0)
 
 
+def _drawn_constants(count: int, rng: np.random.Generator, *ranges: tuple[float, float]) -> Array:
+    """Constants (C, N): the mirror's, one within each range, from which those of an actuator differ by a tenth."""
+    middle = [rng.uniform(low, high) for low, high in ranges]
+    return np.exp(0.1 * rng.standard_normal((len(ranges), count))) * np.array(middle)[:, None]
+
+
+def _drawn_preisach(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    return PreisachOperator(count, drawn_density(count, rng))
+
+
 def _drawn_bouc_wen(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    """Order and constants of the mirror, from which those of an actuator differ by a tenth."""
-    middle = (rng.uniform(0.8, 3.0), rng.uniform(1.5, 3.0), rng.uniform(1.5, 3.0), rng.uniform(0.3, 1.2))
-    own = np.exp(0.1 * rng.standard_normal((4, count)))
-    return BoucWenHysteresis(count, *(own * np.array(middle)[:, None]))
+    return BoucWenHysteresis(count, *_drawn_constants(count, rng, (0.8, 3.0), (1.5, 3.0), (1.5, 3.0), (0.3, 1.2)))
 
 
 def _drawn_jiles_atherton(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    """Constants of the mirror, from which those of an actuator differ by a tenth."""
-    middle = (rng.uniform(0.5, 1.2), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.4), rng.uniform(0.02, 0.1))
-    return JilesAthertonHysteresis(count, *(np.exp(0.1 * rng.standard_normal((4, count))) * np.array(middle)[:, None]))
+    return JilesAthertonHysteresis(
+        count, *_drawn_constants(count, rng, (0.5, 1.2), (0.2, 0.5), (0.1, 0.4), (0.02, 0.1))
+    )
 
 
 def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
     """Both in parts that differ between the actuators, each law alone with a loop of the same opening."""
     share = np.clip(rng.uniform(0.2, 0.8) + 0.1 * rng.standard_normal(count), 0.0, 1.0)
     parts = []
-    for law, part in (
-        (PreisachOperator(count, drawn_density(count, rng)), share),
-        (_drawn_bouc_wen(count, rng), 1 - share),
-    ):
+    for law, part in ((_drawn_preisach(count, rng), share), (_drawn_bouc_wen(count, rng), 1 - share)):
         rising, falling = _full_loop(law, count)
         parts.append((part / np.max(falling - rising, axis=0), law))
     return MixedHysteresis(tuple(parts))
 
 
-def _make(law: str, count: int, rng: np.random.Generator) -> HysteresisLaw:
-    match law:
-        case "none":
-            return NoHysteresis(count)
-        case "prandtl_ishlinskii":
-            return PreisachOperator(count, prandtl_ishlinskii_density)
-        case "preisach":
-            return PreisachOperator(count, skew_density)
-        case "bouc_wen":
-            return BoucWenHysteresis(count, 1.0, 2.2, 2.2, 1.0)
-        case "mixed":
-            bouc_wen = BoucWenHysteresis(count, 2.0, 2.0, 3.2, 0.8)
-            return MixedHysteresis(((4.0, PreisachOperator(count, skew_density)), (0.5, bouc_wen)))
-        case "drawn_preisach":
-            return PreisachOperator(count, drawn_density(count, rng))
-        case "drawn_bouc_wen":
-            return _drawn_bouc_wen(count, rng)
-        case "drawn_mixed":
-            return _drawn_mixed(count, rng)
-        case "drawn_jiles_atherton":
-            return _drawn_jiles_atherton(count, rng)
-    raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
+def _mixed(count: int, _rng: np.random.Generator) -> HysteresisLaw:
+    bouc_wen = BoucWenHysteresis(count, 2.0, 2.0, 3.2, 0.8)
+    return MixedHysteresis(((4.0, PreisachOperator(count, skew_density)), (0.5, bouc_wen)))
 
 
-#: Laws whose name begins with `drawn` are drawn at random, for each actuator its own; the others are all actuators'.
-LAWS = (
-    *("none", "prandtl_ishlinskii", "preisach", "bouc_wen", "mixed"),
-    *("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_jiles_atherton"),
-)
+#: Laws by name. Those that begin with `drawn` are drawn at random, for each actuator its own; the others are all
+#: actuators'.
+LAWS: dict[str, Callable[[int, np.random.Generator], HysteresisLaw]] = {
+    "none": lambda count, rng: NoHysteresis(count),
+    "prandtl_ishlinskii": lambda count, rng: PreisachOperator(count, prandtl_ishlinskii_density),
+    "preisach": lambda count, rng: PreisachOperator(count, skew_density),
+    "bouc_wen": lambda count, rng: BoucWenHysteresis(count, 1.0, 2.2, 2.2, 1.0),
+    "mixed": _mixed,
+    "drawn_preisach": _drawn_preisach,
+    "drawn_bouc_wen": _drawn_bouc_wen,
+    "drawn_mixed": _drawn_mixed,
+    "drawn_jiles_atherton": _drawn_jiles_atherton,
+}
 
 
 class Hysteresis:
@@ -193,7 +187,9 @@ class Hysteresis:
     """
 
     def __init__(self, law: str, fraction: Array | float, count: int, rng: np.random.Generator | None = None) -> None:
-        self._law = _make(law, count, rng if rng is not None else np.random.default_rng(0))
+        if law not in LAWS:
+            raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
+        self._law = LAWS[law](count, rng if rng is not None else np.random.default_rng(0))
         self._weight, self._scale = np.zeros(count), np.ones(count)
         if law != "none" and np.any(fraction):
             self._weight, self._scale = _weight_and_scale(law, self._law, np.broadcast_to(fraction, count))

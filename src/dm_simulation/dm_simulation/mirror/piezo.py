@@ -28,7 +28,7 @@ class PiezoConfig:
     )
     gain_spread: float = parameter(real(0.03, 0.0, 0.3), "Standard deviation of relative gains.")
     law: str = parameter(
-        text("prandtl_ishlinskii", choices=LAWS), "Hysteresis law; drawn_* = each actuator its own, by the seed."
+        text("prandtl_ishlinskii", choices=tuple(LAWS)), "Hysteresis law; drawn_* = each actuator its own, by the seed."
     )
     hysteresis: float = parameter(real(0.10, 0.0, 0.3), "Widest loop opening over the full stroke.")
     hysteresis_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative loop openings.")
