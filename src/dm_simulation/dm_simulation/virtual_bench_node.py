@@ -44,30 +44,17 @@ DRIVER_LEAVES_S = 4.0
 READING_S = 2.0
 
 
-class FastClock:
-    """Starts at the Unix time of its making and runs at `speed` times the wall clock."""
-
-    def __init__(self, speed: float) -> None:
-        self.speed = speed
-        self._start_ns = time.time_ns()
-        self._origin_ns = time.monotonic_ns()
-
-    def now_ns(self) -> int:
-        """Time in ns since the Unix epoch."""
-        return self._start_ns + round(self.speed * (time.monotonic_ns() - self._origin_ns))
-
-
 class VirtualBenchNode(Node):
     """Runs one :class:`dm_simulation.bench.VirtualBench`."""
 
     def __init__(self) -> None:
         super().__init__("virtual_bench")
         values = declare(self, PARAMETERS, self._on_change, check=self._check_change)
-        speed = values["clock.speed"]
-        self._fast_clock = FastClock(speed) if speed > 0 else None
+        self._speed = speed = values["clock.speed"]
+        self._began_ns, self._origin_ns = time.time_ns(), time.monotonic_ns()
         self._stop = threading.Event()
         try:
-            self.bench = VirtualBench(bench_config(values), self._now, self._on_event)
+            self.bench = VirtualBench(bench_config(values), lambda: self._now().nanoseconds * 1e-9, self._on_event)
         except PortError as error:
             raise OSError(f"{error}{held_by(error.port)}") from None
 
@@ -78,7 +65,7 @@ class VirtualBenchNode(Node):
         WorkerService(self, SetBool, "~/power", self._power)
         Diagnostics(self, f"virtual {values['mirror.name']}", self._check)
         self._threads: list[threading.Thread] = []
-        if self._fast_clock is not None:
+        if speed:
             # Reliable, depth 1: matches the best-effort subscriptions of all time sources and any stricter one.
             self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
             self._start(self._tick, values["clock.period"])
@@ -100,7 +87,7 @@ class VirtualBenchNode(Node):
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
         if self.bench.config.membrane is not None:
             law = "membrane"
-        pace = f"{speed:g} times as fast as real time" if speed > 0 else "in real time"
+        pace = f"{speed:g} times as fast as real time" if speed else "in real time"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; {pace}")
 
     def _start(self, work: Callable[[float], None], period: float) -> None:
@@ -118,31 +105,31 @@ class VirtualBenchNode(Node):
         if self.bench.camera is not None and "camera.distances" in changes:
             self.bench.camera.place(changes["camera.distances"])
 
-    def _now(self) -> float:
-        if self._fast_clock is not None:
-            return self._fast_clock.now_ns() * 1e-9
-        return self.get_clock().now().nanoseconds * 1e-9
+    def _now(self) -> Time:
+        """The bench's time: with `clock.speed` that many times the wall clock, from the Unix time of the start on."""
+        if self._speed:
+            return Time(nanoseconds=self._began_ns + round(self._speed * (time.monotonic_ns() - self._origin_ns)))
+        return self.get_clock().now()
 
     def _tick(self, period: float) -> None:
-        assert self._fast_clock is not None
         while not self._stop.wait(period):
-            self._clock_publisher.publish(Clock(clock=Time(nanoseconds=self._fast_clock.now_ns()).to_msg()))
+            self._clock_publisher.publish(Clock(clock=self._now().to_msg()))
 
     def _read_temperature(self) -> None:
         reading = Temperature(temperature=self.bench.temperature())
-        reading.header.stamp = Time(nanoseconds=round(self._now() * 1e9)).to_msg()
+        reading.header.stamp = self._now().to_msg()
         self._temperature_publisher.publish(reading)
 
     def _film(self, period: float) -> None:
         while not self._stop.wait(period - time.monotonic() % period):
-            now_ns = round(self._now() * 1e9)
+            now = self._now()
             try:
                 picture = self.bench.photograph()
             except OSError:  # the bench is closing
                 return
             height, width = picture.shape
             message = Image(height=height, width=width, encoding="mono8", step=width)
-            message.header.stamp = Time(nanoseconds=now_ns).to_msg()
+            message.header.stamp = now.to_msg()
             message.header.frame_id = self._camera_frame
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)
