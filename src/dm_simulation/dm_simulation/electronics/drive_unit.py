@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_common.values import parameter, real, whole
 from dm_simulation.electronics import frames
@@ -16,7 +15,6 @@ TRIHEX = (
     *(19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12),
 )
 EDAC40_FULL_SCALE = 65535
-DAC40_FULL_SCALE = 4095
 FACTORY_GLOBAL_OFFSET = 0x2000
 
 
@@ -102,12 +100,8 @@ class DriveUnit:
             touched = slice(None) if frame.command == frames.EDAC40_GLOBAL_OFFSET else frame.channels
             outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
 
-    def take_dac40(self, codes: NDArray[np.int64]) -> None:
-        """Carry out a USB DAC-40 frame: codes (40,) by connector channel."""
-        self.outputs[: frames.CHANNELS] = codes / DAC40_FULL_SCALE
-
     def take_shares(self, outputs: Array) -> None:
-        """Set all channels (C,) to shares of the DAC's range."""
+        """Carry out a frame of a serial unit: all its channels (C,) as shares of the DAC's range."""
         self.outputs[: len(outputs)] = outputs
 
     def actuator_volts(self) -> Array:

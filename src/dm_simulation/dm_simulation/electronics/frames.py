@@ -26,6 +26,7 @@ DAC40_CHANNEL = np.array(
 )
 DAC40_FRAME = 130
 DAC40_START = 0xFF
+DAC40_FULL_SCALE = 4095
 
 
 class FrameError(ValueError):
@@ -97,3 +98,24 @@ def decode_dac40(frame: bytes) -> NDArray[np.int64] | None:
     codes = np.empty(CHANNELS, np.int64)
     codes[DAC40_CHANNEL] = values.ravel()
     return codes
+
+
+def take_dac40(stream: bytearray) -> NDArray[np.float64] | None:
+    """Take one USB DAC-40 frame off the front of `stream`: outputs (40,) as shares of full scale, or None when there is
+    no whole frame yet. An opening block is taken off too.
+
+    Raises:
+        FrameError: bytes that are no frame, which are taken off up to the next start byte, as the unit does.
+    """
+    while len(stream) >= DAC40_FRAME:
+        try:
+            codes = decode_dac40(bytes(stream[:DAC40_FRAME]))
+        except FrameError as error:
+            start = stream.find(DAC40_START, 1)
+            skipped = bytes(stream[:start] if start > 0 else stream)
+            del stream[: len(skipped)]
+            raise FrameError(f"{error} ({skipped[:16].hex(' ')})") from None
+        del stream[:DAC40_FRAME]
+        if codes is not None:
+            return codes / DAC40_FULL_SCALE
+    return None

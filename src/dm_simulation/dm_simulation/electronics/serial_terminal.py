@@ -20,7 +20,7 @@ class SerialTerminal:
         framed: frames of the unit; without channels it is a USB DAC-40.
         loop: runs everything but the making of this object.
         on_update: called after every frame that was carried out.
-        reject: called with source, reason and bytes of what is no frame.
+        reject: called with source and reason where bytes are no frame.
 
     Raises:
         ValueError: a description of frames that makes no sense, naming the parameter.
@@ -32,10 +32,12 @@ class SerialTerminal:
         framed: FramedConfig,
         loop: EventLoop,
         on_update: Callable[[], None],
-        reject: Callable[[str, str, bytes], None],
+        reject: Callable[[str, str], None],
     ) -> None:
         self._unit = unit
-        self._framed = FramedDecoder(framed) if framed.channels else None
+        decoder = FramedDecoder(framed) if framed.channels else None
+        self._take = frames.take_dac40 if decoder is None else decoder.take
+        self._reply = b"" if decoder is None else decoder.reply
         self._loop = loop
         self._on_update = on_update
         self._reject = reject
@@ -82,38 +84,15 @@ class SerialTerminal:
             self._received += os.read(self._descriptors[0], 65536)
         except OSError:
             return
-        if self._framed is not None:
-            self._take_framed(self._framed, self._descriptors[0])
-        else:
-            self._take_dac40()
-
-    def _take_dac40(self) -> None:
-        while len(self._received) >= frames.DAC40_FRAME:
-            frame = bytes(self._received[: frames.DAC40_FRAME])
-            try:
-                codes = frames.decode_dac40(frame)
-            except FrameError as error:
-                # Look for the next start byte, as the unit does.
-                start = self._received.find(frames.DAC40_START, 1)
-                skipped = bytes(self._received[:start] if start > 0 else self._received)
-                del self._received[: len(skipped)]
-                self._reject("serial", str(error), skipped)
-                continue
-            del self._received[: frames.DAC40_FRAME]
-            if codes is not None:
-                self._unit.take_dac40(codes)
-                self._on_update()
-
-    def _take_framed(self, decoder: FramedDecoder, leader: int) -> None:
         while True:
             try:
-                outputs = decoder.take(self._received)
+                outputs = self._take(self._received)
             except FrameError as error:
-                self._reject("serial", str(error), b"")
+                self._reject("serial", str(error))
                 continue
             if outputs is None:
                 return
             self._unit.take_shares(outputs)
             self._on_update()
-            if decoder.reply:
-                os.write(leader, decoder.reply)
+            if self._reply:
+                os.write(self._descriptors[0], self._reply)

@@ -7,7 +7,6 @@ which they arrived, and whoever asks for the state sees every frame that was sen
 import errno
 import socket
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +53,7 @@ class ElectronicsServer:
 
     Attributes:
         endpoints: actual "tcp_port", "udp_port", "discovery_port" and "pty", as far as they are offered.
-        malformed: the last hundred reasons why something received was no frame; `malformed_count` counts all.
+        malformed_count: what was received and is no frame; the reasons are events.
 
     Raises:
         OSError: a port is taken, naming it.
@@ -72,7 +71,6 @@ class ElectronicsServer:
         self._on_update = on_update
         self._on_event = on_event
         self.endpoints: dict[str, int | str] = {}
-        self.malformed: deque[str] = deque(maxlen=100)
         self.malformed_count = 0
         self.plugged = False
         self._listener: socket.socket | None = None
@@ -140,11 +138,10 @@ class ElectronicsServer:
         self._listener = None
         self._terminal.close()
 
-    def _reject(self, source: str, reason: str, data: bytes) -> None:
+    def _reject(self, source: str, reason: str, data: bytes = b"") -> None:
         self.malformed_count += 1
-        text = f"{source}: {reason} ({data[:16].hex(' ')}{' ...' if len(data) > 16 else ''})"
-        self.malformed.append(text)
-        self._on_event(f"malformed frame, {text}")
+        shown = f" ({data[:16].hex(' ')}{' ...' if len(data) > 16 else ''})" if data else ""
+        self._on_event(f"malformed frame, {source}: {reason}{shown}")
 
     def _take_edac40(self, frame: bytes) -> None:
         self._unit.take_edac40(frames.decode_edac40(frame))
