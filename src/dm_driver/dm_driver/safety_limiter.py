@@ -70,16 +70,9 @@ class SafetyLimiter:
                 f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator",
             )
         low, high = limits.low, limits.high
-        inside = (shape >= low - SLACK) & (shape <= high + SLACK)  # False for NaN
-        if not inside.all():
-            finite = np.isfinite(shape)
-            if not finite.all():
-                raise Refusal(
-                    ErrorCode.NOT_FINITE, self._text(name, shape, ~finite, "must be a finite number"), ~finite
-                )
-            raise Refusal(
-                ErrorCode.OUT_OF_RANGE, self._text(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
-            )
+        outside = (shape < low - SLACK) | (shape > high + SLACK)
+        _refuse(ErrorCode.NOT_FINITE, name, shape, ~np.isfinite(shape), "must be a finite number")
+        _refuse(ErrorCode.OUT_OF_RANGE, name, shape, outside, f"must be {low:g} to {high:g}")
         self._check_neighbours(shape, name, SLACK)
         return np.clip(shape, low, high, out=shape)
 
@@ -113,20 +106,14 @@ class SafetyLimiter:
         limits = self.limits
         if shape.shape != (limits.actuators,):
             self.check_shape(shape)
-        outside = ~((shape >= limits.low) & (shape <= limits.high))
-        if outside.any():
-            rule = f"must be {limits.low:g} to {limits.high:g}"
-            raise Refusal(ErrorCode.INTERNAL, self._text("signals", shape, outside, rule), outside)
+        outside = ~((shape >= limits.low) & (shape <= limits.high))  # also NaN
+        rule = f"must be {limits.low:g} to {limits.high:g}"
+        _refuse(ErrorCode.INTERNAL, "signals", shape, outside, rule)
         self._check_neighbours(shape, "signals", SLACK + _ROUNDING)
         if previous is not None:
             change = np.abs(shape - previous)
-            too_large = ~(change <= limits.step + _ROUNDING)
-            if too_large.any():
-                raise Refusal(
-                    ErrorCode.INTERNAL,
-                    self._text("step", change, too_large, f"must be at most {limits.step:g} (limits.step)"),
-                    too_large,
-                )
+            rule = f"must be at most {limits.step:g} (limits.step)"
+            _refuse(ErrorCode.INTERNAL, "step", change, ~(change <= limits.step + _ROUNDING), rule)
 
     def ramp(self, start: Shape, target: Shape) -> Iterator[Shape]:
         """Yield the shapes to write on the way from `start` (excluded) to `target` (included, exactly).
@@ -178,14 +165,6 @@ class SafetyLimiter:
             at_fault,
         )
 
-    @staticmethod
-    def _text(name: str, values: NDArray[np.float64], at_fault: NDArray[np.bool_], rule: str) -> str:
-        first = int(at_fault.argmax())
-        others = int(at_fault.sum()) - 1
-        return f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}" + (
-            f"; {others} more likewise" if others else ""
-        )
-
 
 class Watchdog:
     """Expires when no fresh command came for `period_s`; 0 = never. Starts disarmed."""
@@ -205,6 +184,14 @@ class Watchdog:
 
     def expired(self, now: float) -> bool:
         return now >= self.deadline
+
+
+def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: NDArray[np.bool_], rule: str) -> None:
+    """Raise Refusal naming the first of the actuators `at_fault` (N,) and the rule it breaks; nothing where none is."""
+    if at_fault.any():
+        first, others = int(at_fault.argmax()), int(at_fault.sum()) - 1
+        text = f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}"
+        raise Refusal(code, text + (f"; {others} more likewise" if others else ""), at_fault)
 
 
 def largest_change(start: Shape, target: Shape) -> float:
