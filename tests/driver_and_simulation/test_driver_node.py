@@ -18,13 +18,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from dm_common.ros import qos
-from drive_unit_servers import Edac40TcpUnit, Frame
+from drive_unit_servers import Edac40TcpUnit, signals_of
 from support import NodeProcess, Observer, wait_until
 
-TRIHEX = [
-    *(14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6),
-    *(19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12),
-]
 CODE = 2.0 * 12 * 80 / 300 / 65535
 
 Start = Callable[..., NodeProcess]
@@ -53,12 +49,6 @@ def parameters(unit: Edac40TcpUnit, **changes: Any) -> dict[str, Any]:
     }
     values.update({name.replace("__", "."): value for name, value in changes.items()})
     return {name: value for name, value in values.items() if value is not None}
-
-
-def signals_of(frames: list[Frame]) -> np.ndarray:
-    """(frames, 37) signals on the wire: code 0 is -6 V, full scale +6 V, gain 80, 0..300 V."""
-    codes = np.array([[frame[channel] for channel in TRIHEX] for frame in frames], dtype=float)
-    return (codes / 65535 * 12 - 6) * 80 / 150 - 1
 
 
 class Driver:

@@ -28,6 +28,11 @@ DAC40_TABLE = [
     *(7, 15, 23, 31, 39, 6, 14, 22, 30, 38, 5, 13, 21, 29, 37, 4, 12, 20, 28, 36),
     *(3, 11, 19, 27, 35, 2, 10, 18, 26, 34, 1, 9, 17, 25, 33, 0, 8, 16, 24, 32),
 ]
+#: Connector channels of actuators 1, 2, ... of a trihex mirror.
+TRIHEX = [
+    *(14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6),
+    *(19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12),
+]
 MAC = b"00-04-A3-12-34-56"
 
 Frame = dict[int, int]
@@ -48,6 +53,12 @@ def decode_edac40(data: bytes) -> tuple[Frame | None, bytes]:
     for position, channel in enumerate(physical):
         frame[EDAC40_TABLE.index(channel)] = data[6 + 2 * position] + 256 * data[7 + 2 * position]
     return frame, data[length:]
+
+
+def signals_of(frames: list[Frame]) -> np.ndarray:
+    """(frames, 37) signals on an EDAC40's wire: code 0 is -6 V, full scale +6 V, gain 80, 0..300 V."""
+    codes = np.array([[frame[channel] for channel in TRIHEX] for frame in frames], dtype=float)
+    return (codes / 65535 * 12 - 6) * 80 / 150 - 1
 
 
 def decode_dac40(data: bytes) -> Frame:
@@ -245,6 +256,8 @@ class Edac40UdpUnit(DriveUnit):
 
 class UsbDac40Unit(DriveUnit):
     kind = "usb_dac40"
+    opening = bytes(130)
+    frame_length = 130
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -272,17 +285,21 @@ class UsbDac40Unit(DriveUnit):
                 continue
             data = os.read(self._master, 4096)
             self.raw += data
-            buffer += data
-            while len(buffer) >= 130:
-                part, buffer = buffer[:130], buffer[130:]
-                if any(part):  # 130 zero bytes come once after opening
-                    self.frames.append(decode_dac40(part))
+            buffer = (buffer + data).removeprefix(self.opening)
+            while len(buffer) >= self.frame_length:
+                part, buffer = buffer[: self.frame_length], buffer[self.frame_length :]
+                self._take(part)
+
+    def _take(self, part: bytes) -> None:
+        self.frames.append(decode_dac40(part))
 
 
 class FramedSerialUnit(UsbDac40Unit):
     """A unit whose frames need every part of the description."""
 
     kind = "framed_serial"
+    opening = b"\x55\x55"
+    frame_length = 86
 
     @property
     def settings(self) -> dict[str, object]:
@@ -303,18 +320,9 @@ class FramedSerialUnit(UsbDac40Unit):
         )
         return {"serial_port": str(self._path), "frame": frame}
 
-    def _serve(self) -> None:
-        buffer = b""
-        while not self._stop.is_set():
-            if not select.select([self._master], [], [], 0.02)[0]:
-                continue
-            data = os.read(self._master, 4096)
-            self.raw += data
-            buffer = (buffer + data).removeprefix(b"\x55\x55")
-            while len(buffer) >= 86:
-                part, buffer = buffer[:86], buffer[86:]
-                self.frames.append(decode_framed(part))
-                os.write(self._master, b"\x06")
+    def _take(self, part: bytes) -> None:
+        self.frames.append(decode_framed(part))
+        os.write(self._master, b"\x06")
 
 
 #: What the device server of python-microscope is to serve; it prints every pattern that the mirror takes.

@@ -18,9 +18,9 @@ from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
 from dm_driver.moves import Kind, Move, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
-from dm_driver.output.wiring import TABLES, wiring_table
+from dm_driver.output.wiring import wiring_table
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
-from drive_unit_servers import Edac40TcpUnit, Frame
+from drive_unit_servers import Edac40TcpUnit, signals_of
 from waiting import wait_until
 
 PAIRS = neighbour_pairs(*hexagonal_positions(37))
@@ -59,12 +59,6 @@ def running_writer(
         yield writer, told
     finally:
         assert writer.stop()
-
-
-def signals_of(frames: list[Frame]) -> np.ndarray:
-    """(frames, 37) signals on the wire: code 0 is -6 V, full scale +6 V, gain 80, 0..300 V."""
-    codes = np.array([[frame[channel] for channel in TABLES["trihex"]] for frame in frames], dtype=float)
-    return (codes / 65535 * 12 - 6) * 80 / 150 - 1
 
 
 def shape(value: float) -> np.ndarray:
