@@ -15,9 +15,8 @@ from dm_common.values import from_values
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.frame_format import FrameFormat
-from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
-from dm_driver.output.wiring import wiring_table
+from dm_driver.output.wiring import OutputStage, wiring_table
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter, Shape
 
 

@@ -16,7 +16,7 @@ from dm_driver.electronics.base import DriveElectronics, ElectronicsError
 from dm_driver.last_shape import LastShape
 from dm_driver.move_queue import MoveQueue
 from dm_driver.moves import Counters, Kind, Move, Outcome, WriterState
-from dm_driver.output.output_stage import OutputStage
+from dm_driver.output.wiring import OutputStage
 from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog
 
 RECONNECT_PERIOD_S = 1.0

@@ -16,9 +16,8 @@ from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
 from dm_driver.moves import Kind, Move, Outcome, WriterState
-from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
-from dm_driver.output.wiring import wiring_table
+from dm_driver.output.wiring import OutputStage, wiring_table
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from drive_unit_servers import Edac40TcpUnit, signals_of
 from waiting import wait_until

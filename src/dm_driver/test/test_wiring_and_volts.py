@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import LAWS, VoltScale
-from dm_driver.output.wiring import TABLES, wiring_table
+from dm_driver.output.wiring import TABLES, OutputStage, wiring_table
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))

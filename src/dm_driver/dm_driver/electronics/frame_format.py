@@ -24,20 +24,6 @@ MOST_BITS: Final = 16
 MOST_WORD_BITS: Final = 32
 
 
-def parse_hex(name: str, text: str) -> bytes:
-    """Bytes of "A5 5A".
-
-    Raises:
-        ValueError: naming the parameter and its value.
-    """
-    try:
-        return bytes.fromhex(text)
-    except ValueError:
-        raise ValueError(
-            f"{name} = {text!r}: must be bytes as pairs of hexadecimal digits, such as 'A5 5A'; empty = none"
-        ) from None
-
-
 @dataclass(frozen=True)
 class FrameFormat:
     """One unit's frames and line.
@@ -82,7 +68,13 @@ class FrameFormat:
 
     def __post_init__(self) -> None:
         for name in ("header", "terminator", "opening", "reply"):
-            parse_hex(f"framed_serial.{name}", getattr(self, name))
+            try:
+                bytes.fromhex(getattr(self, name))
+            except ValueError:
+                raise ValueError(
+                    f"framed_serial.{name} = {getattr(self, name)!r}: must be bytes as pairs of hexadecimal digits,"
+                    " such as 'A5 5A'; empty = none"
+                ) from None
         if len(self.channel_order) and sorted(self.channel_order) != list(range(self.channels)):
             raise ValueError(
                 f"framed_serial.channel_order = {list(self.channel_order)}: must hold each of 0 to {self.channels - 1}"
