@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_autofocus.search.focus_search import FocusSearch
-from dm_autofocus.search.motion_tracking import MotionTracker
 from dm_autofocus.search.peak_search import Peak
-from dm_autofocus.search.tracking import TrackConfig, Tracker
+from dm_autofocus.search.tracking import MotionTracker, TrackConfig, Tracker
 from dm_autofocus.sharpness import cut, tenengrad
 from studies.autofocus.rivals import RIVALS, Task
 from studies.autofocus.scenes import RANGE, SIZE, Scene, SceneCamera, draw_scene
@@ -30,8 +29,8 @@ START, SPEED, NEAREST = 9.0, 1.0, 5.2
 CHANGE, WALK, BROAD, WALKER = 1.0, 320.0, 120, 0.04
 #: Of the lamps [Hz].
 FLICKER = 100.0
-#: As the node has them: dither in depths of focus, drop, patience, wait [s].
-DITHER, DROP, PATIENCE, WAIT = 0.5, 0.3, 3, 1.0
+#: As the node does by default.
+TRACKED = TrackConfig()
 KINDS = ("approach", "light", "flicker", "walker")
 
 
@@ -93,12 +92,11 @@ class Stage:
 def track(stage: Stage, by_optics: bool = True) -> None:
     """As the node does, by the optics or by sharpness alone."""
     config, model = search_of(stage.scene), model_of(stage.scene)
-    trials = TrackConfig(DITHER * config.tolerance, DROP, PATIENCE, WAIT)
 
     def tracker_of(peak: Peak) -> Tracker:
         if by_optics:
-            return MotionTracker(peak, config, trials, model)
-        return Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+            return MotionTracker(peak, config, TRACKED, model)
+        return Tracker(peak, config, TRACKED)
 
     tracker = tracker_of(Peak(stage.scene.start, tenengrad(stage.expose()[1]), False))
     while stage.running:
@@ -120,8 +118,8 @@ def search_anew(stage: Stage) -> None:
     normal, other = tenengrad(stage.expose()[1]), 0
     while stage.running:
         sharpness = tenengrad(stage.expose()[1])
-        other = other + 1 if abs(sharpness - normal) > DROP * normal else 0
-        if other < PATIENCE:
+        other = other + 1 if abs(sharpness - normal) > TRACKED.drop * normal else 0
+        if other < TRACKED.patience:
             continue
         search = RIVALS["contrast rules"](Task(-RANGE, RANGE, stage.place, COARSE_STEP * depth, depth))
         try:

@@ -16,15 +16,14 @@ from dm_autofocus.probe_action import ASKED, START_GRACE_S, ProbeAction, range_o
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
-from dm_autofocus.search.motion_tracking import MotionTracker
 from dm_autofocus.search.peak_search import Peak, Phase, SearchConfig
-from dm_autofocus.search.tracking import TrackConfig, Tracker
+from dm_autofocus.search.tracking import MotionTracker, TrackConfig, Tracker
 from dm_autofocus.sharpness import Region, check_region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
-from dm_common.values import Fields, reals
+from dm_common.values import Fields, from_values, reals
 
 #: What moves are refused with while a controller that died is away, and until it has learnt all that it needs.
 _AWAY = (ErrorCode.TIMEOUT, ErrorCode.NODE_INACTIVE, ErrorCode.DRIVER_UNAVAILABLE, ErrorCode.NOT_CALIBRATED)
@@ -184,17 +183,11 @@ class AutofocusAction(ProbeAction):
 
     def _tracker(self, peak: Peak, config: SearchConfig, region: Region) -> Tracker:
         """What stays on a peak: by the optics where camera and mirror are known, else by sharpness alone."""
-        values = self._values
-        trials = TrackConfig(
-            values["track.dither"] * config.tolerance,
-            values["track.drop"],
-            values["track.patience"],
-            values["track.wait"],
-        )
+        trials = from_values(TrackConfig, self._values, "track.")
         model = self._model(config, region)
         if isinstance(model, DefocusModel) and trials.dither > 0 and not self._doubt():
             return MotionTracker(peak, config, trials, model)
-        return Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+        return Tracker(peak, config, trials)
 
     def _report(
         self,

@@ -7,8 +7,10 @@ from typing import Any, Final
 from dm_autofocus.optics import FocusOptics, depth_of_focus
 from dm_autofocus.search.defocus_model import FocusLens
 from dm_autofocus.search.peak_search import NOISE_POINTS, SearchConfig
+from dm_autofocus.search.tracking import TrackConfig
 from dm_autofocus.sharpness import METRICS, check_region
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, reals, switch, text, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter, parameters_of, real, reals, switch, text, whole
+from dm_common.values import from_values
 
 PARAMETERS: Final = (
     AUTOSTART,
@@ -61,41 +63,18 @@ PARAMETERS: Final = (
         real(8.0, 1.0, 1000.0),
         "Step of the first sweep over the range, in units of the finest step.",
     ),
-    Parameter("search.fine_points", whole(7, 5, 1000), "Positions of each later sweep."),
     Parameter(
         "search.tolerance",
         real(0.0, 0.0, 1.0, "1/m"),
         "Finest step of curvature; 0 = the depth of focus of the calibrated aperture (a quarter wave at its edge).",
     ),
-    Parameter(
-        "search.approach",
-        real(1.0, 0.0, 1.0, "1/m"),
-        "Where the mirror's hysteresis is not known, or moves may err by two depths of focus, every sweep begins this "
-        "far below its first position, but not below the range: the whole range puts all sweeps on one branch, less is "
-        "quicker.",
-    ),
+    *parameters_of("search.", SearchConfig),
     Parameter(
         "search.few_images",
         switch(True),
         "Find the focus from how blurred a few images are, where the optics are known; false = always sweep the range.",
     ),
-    Parameter(
-        "search.least_contrast",
-        real(0.05, 0.0, 0.99),
-        "Relative change of sharpness over the range below which there is nothing to focus on.",
-    ),
-    Parameter(
-        "track.dither",
-        real(0.5, 0.0, 10.0),
-        "Tracking: trials this far below and above the focus, in units of the finest step; 0 = stand still and watch.",
-    ),
-    Parameter("track.drop", real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search."),
-    Parameter("track.patience", whole(3, 1, 1000), "Tracking: images in a row that must have lost it."),
-    Parameter(
-        "track.wait",
-        real(1.0, 0.0, 60.0, "s"),
-        "Tracking: how long the object may be hidden, by somebody who walks past, before a new search begins.",
-    ),
+    *parameters_of("track.", TrackConfig),
     Parameter(
         "stack.step",
         real(4.0, 0.5, 1000.0),
@@ -135,18 +114,11 @@ def search_config(values: Mapping[str, Any], aperture_radius: float, low: float,
     """The search of a range of curvatures [1/m].
 
     Raises:
-        ValueError: there is nothing between `low` and `high`, or the aperture has no radius.
+        ValueError: the aperture has no radius.
     """
     tolerance = tolerance_of(values, aperture_radius)
-    coarse_points = 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))
-    return SearchConfig(
-        low,
-        high,
-        tolerance,
-        coarse_points=max(NOISE_POINTS, coarse_points),
-        fine_points=values["search.fine_points"],
-        least_contrast=values["search.least_contrast"],
-    )
+    points = max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance)))
+    return from_values(SearchConfig, values, "search.", low=low, high=high, tolerance=tolerance, coarse_points=points)
 
 
 def given_focal_length(values: Mapping[str, Any], camera_info: Any) -> float:

@@ -55,6 +55,8 @@ def range_of(goal: Any, capabilities: Capabilities) -> tuple[float, float]:
                 f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
             )
         low, high = max(wanted[0], low), min(wanted[1], high)
+    if not low < high:
+        raise Refusal(ErrorCode.OUT_OF_RANGE, f"range of curvatures = {low} to {high} 1/m: must be finite and rising")
     return low, high
 
 

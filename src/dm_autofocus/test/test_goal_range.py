@@ -7,9 +7,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from dm_msgs.action import Autofocus
 from dm_msgs.msg import Capabilities
 
-from dm_autofocus.probe_action import ready_capabilities
+from dm_autofocus.autofocus_parameters import PARAMETERS, search_config
+from dm_autofocus.probe_action import range_of, ready_capabilities
 from dm_common.errors import ErrorCode, Refusal
 
 
@@ -25,3 +27,37 @@ def test_a_mirror_that_reaches_nothing_is_not_focused() -> None:
     with pytest.raises(Refusal, match="no curvature is reachable") as refused:
         ready_capabilities(cast(Any, probe))
     assert refused.value.error_code == ErrorCode.UNREACHABLE
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.05, 0.05), (0.05, -0.05), (math.nan, 0.05), (-math.inf, 0.05)])
+def test_a_range_without_curvatures_is_refused(low: float, high: float) -> None:
+    with pytest.raises(Refusal, match=r"range of curvatures = .* must be finite and rising") as refused:
+        range_of(Autofocus.Goal(), Capabilities(curvature_min=low, curvature_max=high))
+    assert refused.value.error_code == ErrorCode.OUT_OF_RANGE
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("search.tolerance", -1.0),
+        ("search.coarse_step", 0.5),
+        ("search.fine_points", 4),
+        ("search.approach", -1.0),
+        ("search.least_contrast", 1.0),
+        ("track.dither", -1.0),
+        ("track.drop", 1.0),
+        ("track.patience", 0),
+        ("track.wait", -1.0),
+    ],
+)
+def test_a_senseless_search_is_refused(name: str, value: float) -> None:
+    (parameter,) = (each for each in PARAMETERS if each.name == name)
+    with pytest.raises(ValueError, match=f"{name} = {value}: must be "):
+        parameter.check(value)
+
+
+def test_a_short_range_is_swept_with_points_enough_to_tell_a_hill_from_noise() -> None:
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    assert search_config(values, 0.011, 0.0, 1e-4).coarse_points == 11
+    with pytest.raises(ValueError, match=r"aperture_radius = 0.0 m: must be above 0"):
+        search_config(values, 0.0, 0.0, 0.01)

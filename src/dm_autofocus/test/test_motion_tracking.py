@@ -9,9 +9,8 @@ import pytest
 from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
 
 from dm_autofocus.search.defocus_model import DefocusModel
-from dm_autofocus.search.motion_tracking import MotionTracker
 from dm_autofocus.search.peak_search import Peak, SearchConfig
-from dm_autofocus.search.tracking import TrackConfig
+from dm_autofocus.search.tracking import BEFORE, MotionTracker, TrackConfig
 from dm_autofocus.sharpness import tenengrad
 
 LOW, HIGH = -0.05, 0.05
@@ -24,7 +23,7 @@ def model() -> DefocusModel:
 
 
 def tracker_at(place: float, model: DefocusModel, sharpness: float) -> MotionTracker:
-    return MotionTracker(Peak(place, sharpness, False), SearchConfig(LOW, HIGH, DEPTH), TrackConfig(DEPTH / 2), model)
+    return MotionTracker(Peak(place, sharpness, False), SearchConfig(LOW, HIGH, DEPTH), TrackConfig(wait=0.0), model)
 
 
 def follow(model: DefocusModel, start: float, speed: float, images: int) -> tuple[MotionTracker, np.ndarray]:
@@ -52,7 +51,7 @@ def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: flo
 def test_it_ends_near_the_end_of_the_range(model: DefocusModel) -> None:
     """Where the object was a few images before it was lost."""
     tracker, _off = follow(model, HIGH - 0.01, 0.03, 30)
-    assert HIGH - tracker.centre < tracker.BEFORE * 0.03 * PERIOD + DEPTH and LOW <= tracker.step.curvature <= HIGH
+    assert HIGH - tracker.centre < BEFORE * 0.03 * PERIOD + DEPTH and LOW <= tracker.step.curvature <= HIGH
 
 
 @pytest.mark.parametrize("cover", [0.1, 4.0])
@@ -60,8 +59,7 @@ def test_the_focus_waits_while_somebody_walks_past(model: DefocusModel, cover: f
     """Duller or sharper than the object: for half a second nothing of theirs is believed."""
     camera = DefocusedCamera(clouds(3), 0.01)
     normal = tenengrad(camera.expose(0.01))
-    trials = TrackConfig(DEPTH / 2, wait=1.0)
-    tracker = MotionTracker(Peak(0.01, normal, False), SearchConfig(LOW, HIGH, DEPTH), trials, model)
+    tracker = MotionTracker(Peak(0.01, normal, False), SearchConfig(LOW, HIGH, DEPTH), TrackConfig(), model)
     for number in range(40):
         image = camera.expose(tracker.step.curvature)
         covered = 10 <= number < 25

@@ -19,6 +19,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, real, whole
+
 #: Standard deviations of noise that the top of a hill must stand above the median of its sweep.
 SIGNIFICANCE = 6.0
 #: Standard errors of its mean that the sweep after it must stand above that median, too.
@@ -58,36 +60,24 @@ class SearchConfig:
         low, high: range of curvatures [1/m], low < high.
         tolerance: depth of focus: steps are not made finer than this [1/m], above 0.
         coarse_points: positions of the first sweep, at least 4.
-        fine_points: positions of each later sweep, at least 5.
-        approach: how far below its first position a sweep begins [1/m], never below `low`; inf = at `low`; 0 = nowhere:
-            the mirror stands where it is sent, wherever it comes from.
-        least_contrast: relative rise of the sharpest coarse image over the dullest below which there is no hill, 0..1.
-
-    Raises:
-        ValueError: a value outside its range.
+        fine_points, approach, least_contrast: see the parameters; an approach of 0: the mirror stands where it is sent,
+            wherever it comes from.
     """
 
     low: float
     high: float
     tolerance: float
     coarse_points: int = 11
-    fine_points: int = 7
-    approach: float = math.inf
-    least_contrast: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
-            raise ValueError(f"range of curvatures = {self.low} to {self.high} 1/m: must be finite and rising")
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
-            raise ValueError(f"tolerance = {self.tolerance} 1/m: must be above 0")
-        if self.coarse_points < 4:
-            raise ValueError(f"coarse_points = {self.coarse_points}: must be at least 4")
-        if self.fine_points < 5:
-            raise ValueError(f"fine_points = {self.fine_points}: must be at least 5")
-        if not self.approach >= 0:
-            raise ValueError(f"approach = {self.approach} 1/m: must be 0 or more")
-        if not 0 <= self.least_contrast < 1:
-            raise ValueError(f"least_contrast = {self.least_contrast}: must be from 0 to below 1")
+    fine_points: int = parameter(whole(7, 5, 1000), "Positions of each later sweep.")
+    approach: float = parameter(
+        real(1.0, 0.0, 1.0, "1/m"),
+        "Where the mirror's hysteresis is not known, or moves may err by two depths of focus, every sweep begins this "
+        "far below its first position, but not below the range: the whole range puts all sweeps on one branch, less is "
+        "quicker.",
+    )
+    least_contrast: float = parameter(
+        real(0.05, 0.0, 0.99), "Relative change of sharpness over the range below which there is nothing to focus on."
+    )
 
     @property
     def steps(self) -> int:

@@ -1,44 +1,55 @@
-"""Staying on the sharpest focus: a state machine like `PeakSearch`, for a scene that changes."""
+"""Staying on the sharpest focus: state machines like `PeakSearch`, for a scene that changes.
+
+A `Tracker` goes by sharpness alone. A `MotionTracker` knows camera and mirror: the images of the last moments, taken
+half a dither below and above where the focus is believed to be, say through the optics (`DefocusModel`) where it is, if
+it moved at a speed. Each speed of a few is tried, with the images shifted by what the object has moved since. What is
+believed already weighs as a normal distribution of both.
+"""
 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.search.peak_search import Step
+from dm_autofocus.search.defocus_model import TRANSFER_ERROR_NEAR, DefocusModel, Floats
+from dm_autofocus.search.peak_search import Peak, SearchConfig, Step
+from dm_common.values import parameter, real, whole
+
+#: Share by which the normal sharpness follows each image.
+FORGETTING = 0.02
+#: Images before a change whose centre is gone back to: who comes in changes little at first.
+BEFORE = 6
+#: Images that count at a time for a motion, and from how many on they say something.
+IMAGES, FEWEST = 5, 3
+#: How far from the believed place the focus is sought, and steps of that grid, in depths of focus.
+REACH, GRID = 12.0, 0.25
+#: Changes of speed that are tried at each image, in depths of focus per second.
+SPEEDS = 5.0 * np.arange(-3, 4)
+#: Standard deviations of what is believed of place [depths of focus] and speed [depths of focus per second].
+PLACE_SIGMA, SPEED_SIGMA = 3.0, 8.0
+#: Share by which the period follows each image, and longest one that counts [s].
+PERIOD_SHARE, PERIOD_MAX = 0.3, 0.3
 
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """How to stay on the peak.
+    """How to stay on the peak."""
 
-    Attributes:
-        dither: the focus is tried this far below and above [1/m]; 0 = it stands still and is only watched.
-        drop: relative loss of sharpness that means: lost, search again; 0..1.
-        patience: images in a row that must have lost it.
-        wait: s after which it counts as lost: until then it may be hidden, and the focus stands still.
-    """
-
-    dither: float = 0.0
-    drop: float = 0.3
-    patience: int = 3
-    wait: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.dither) and self.dither >= 0):
-            raise ValueError(f"dither = {self.dither} 1/m: must be 0 or more")
-        if not 0 < self.drop < 1:
-            raise ValueError(f"drop = {self.drop}: must lie between 0 and 1")
-        if self.patience < 1:
-            raise ValueError(f"patience = {self.patience}: must be at least 1")
-        if not self.wait >= 0:
-            raise ValueError(f"wait = {self.wait} s: must not be negative")
+    dither: float = parameter(
+        real(0.5, 0.0, 10.0),
+        "Tracking: trials this far below and above the focus, in units of the finest step; 0 = stand still and watch.",
+    )
+    drop: float = parameter(real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search.")
+    patience: int = parameter(whole(3, 1, 1000), "Tracking: images in a row that must have lost it.")
+    wait: float = parameter(
+        real(1.0, 0.0, 60.0, "s"),
+        "Tracking: how long the object may be hidden, by somebody who walks past, before a new search begins.",
+    )
 
 
-@dataclass
 class Tracker:
     """Follows a peak that was found: small trials below and above, and `lost` when the sharpness has dropped.
 
@@ -46,30 +57,26 @@ class Tracker:
     walks through the region changes it at once, to either side, and is gone soon: the focus goes back to where it was
     before, and waits.
 
+    Args:
+        peak: what was found.
+        search: range and tolerance of the search.
+        config: how to stay on it.
+
     Attributes:
         centre: where the peak is believed to be [1/m].
         sharpness: the normal sharpness there.
-        low, high: range of curvatures [1/m].
         step: where to measure next.
         lost: search again.
         hidden: the sharpness is another one at once, and may come back.
     """
 
-    centre: float
-    sharpness: float
-    low: float
-    high: float
-    config: TrackConfig = field(default_factory=TrackConfig)
-
-    #: Share by which the normal sharpness follows each image.
-    FORGETTING = 0.02
-    #: Images before a change whose centre is gone back to: who comes in changes little at first.
-    BEFORE = 6
-
-    def __post_init__(self) -> None:
+    def __init__(self, peak: Peak, search: SearchConfig, config: TrackConfig) -> None:
+        self.centre, self.sharpness = peak.curvature, peak.sharpness
         self.lost = self.hidden = False
+        self._search, self._config = search, config
+        self._dither = config.dither * search.tolerance
         self._changed, self._since = 0, math.nan
-        self._before = deque([self.centre], maxlen=self.BEFORE)
+        self._before = deque([self.centre], maxlen=BEFORE)
         self._trial: deque[float] = deque()
         self.step = Step(self.centre)
 
@@ -88,35 +95,36 @@ class Tracker:
         if self.hidden:
             self._trial.clear()
             self.step = Step(self.centre)
-        elif self.config.dither > 0:
+        elif self._dither > 0:
             self._trial.append(sharpness)
             if len(self._trial) == 3:
                 self._move()
-            self.step = Step(min(max(self.centre + self._offset(), self.low), self.high))
+            offset = (0.0, -self._dither, self._dither)[len(self._trial)]
+            self.step = Step(self._inside(self.centre + offset))
+
+    def _inside(self, place: float) -> float:
+        return min(max(place, self._search.low), self._search.high)
 
     def _watch(self, sharpness: float, time: float) -> None:
         """Whether the peak is hidden or lost, by the sharpness of an image."""
         if not math.isfinite(sharpness):
             raise ValueError(f"sharpness = {sharpness}: must be a finite number")
-        least = 1 - self.config.drop
+        least = 1 - self._config.drop
         dull = sharpness < least * self.sharpness
         if not (dull or least * sharpness > self.sharpness):
-            self.sharpness += self.FORGETTING * (sharpness - self.sharpness)
+            self.sharpness += FORGETTING * (sharpness - self.sharpness)
             self._changed, self.hidden = 0, False
             self._before.append(self.centre)
             return
         self._changed += 1
-        if self._changed < self.config.patience:
+        if self._changed < self._config.patience:
             return
         if not self.hidden:
             self.hidden, self._since, self.centre = True, time, self._before[0]
-        if not time - self._since < self.config.wait:  # without times it counts as lost at once
+        if not time - self._since < self._config.wait:  # without times it counts as lost at once
             self.lost = self.lost or dull
             if not dull:
                 self.sharpness, self._changed, self.hidden = sharpness, 0, False
-
-    def _offset(self) -> float:
-        return (0.0, -self.config.dither, self.config.dither)[len(self._trial)]
 
     def _move(self) -> None:
         """Three trials, at the centre, below and above: go towards the top of their parabola."""
@@ -125,5 +133,73 @@ class Tracker:
         bend = below - 2 * middle + above
         # A quarter of the way: noise moves the centre little, and a drift is still followed.
         share = 0.5 * (below - above) / bend if bend < 0 else float(np.sign(above - below))
-        self.centre += 0.25 * self.config.dither * min(max(share, -2.0), 2.0)
-        self.centre = min(max(self.centre, self.low), self.high)
+        self.centre = self._inside(self.centre + 0.25 * self._dither * min(max(share, -2.0), 2.0))
+
+
+class MotionTracker(Tracker):
+    """A tracker for a camera and a mirror that are known.
+
+    Args:
+        peak, search: as of a `Tracker`.
+        config: likewise; its dither is above 0.
+        model: of the camera.
+
+    Attributes:
+        speed: of the focus [1/m per s].
+    """
+
+    def __init__(self, peak: Peak, search: SearchConfig, config: TrackConfig, model: DefocusModel) -> None:
+        super().__init__(peak, search, config)
+        self.speed = 0.0
+        self._model = model
+        self._images: deque[tuple[float, float, Floats]] = deque(maxlen=IMAGES)  # time, place, powers
+        self._period = 0.0
+        self._sign = 1
+        self._aim()
+
+    def feed(self, sharpness: float, images: Sequence[NDArray] = (), time: float = math.nan) -> None:
+        self._watch(sharpness, time)
+        if self.hidden:
+            self.speed = 0.0
+            self._images.clear()
+            self.step = Step(self.centre)
+            return
+        if any(image.shape != self._model.shape for image in images):
+            self.lost = True
+            return
+        if self._images:
+            passed = min(max(time - self._images[-1][0], 0.0), PERIOD_MAX)
+            self.centre += self.speed * passed
+            self._period += PERIOD_SHARE * (passed - self._period) if self._period else passed
+        powers = np.mean([self._model.powers(image) for image in images], axis=0)
+        self._images.append((time, self.step.curvature, powers))
+        if len(self._images) >= FEWEST:
+            self._estimate()
+        inside = self._inside(self.centre)
+        if inside != self.centre:
+            self.centre, self.speed = inside, 0.0
+        self._aim()
+
+    def _estimate(self) -> None:
+        """Place and speed by the latest images."""
+        times, places, powers = (np.array(part) for part in zip(*self._images, strict=True))
+        tolerance, ago = self._search.tolerance, times[-1] - times
+        offsets = tolerance * np.arange(-REACH, REACH + GRID / 2, GRID)
+        misfit = np.array(
+            [
+                self._model.judge(
+                    self.centre + offsets, places + (self.speed + more * tolerance) * ago, powers, TRANSFER_ERROR_NEAR
+                )[0]
+                for more in SPEEDS
+            ]
+        )
+        misfit += (offsets / (PLACE_SIGMA * tolerance)) ** 2 + (SPEEDS[:, None] / SPEED_SIGMA) ** 2
+        weights = np.exp((misfit.min() - misfit) / 2)
+        weights /= weights.sum()
+        self.centre += float(weights.sum(0) @ offsets)
+        self.speed += tolerance * float(weights.sum(1) @ SPEEDS)
+
+    def _aim(self) -> None:
+        """The next image: where the focus will be then, below and above by turns."""
+        self._sign = -self._sign
+        self.step = Step(self._inside(self.centre + self.speed * self._period + self._sign * self._dither))
