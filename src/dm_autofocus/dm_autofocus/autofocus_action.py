@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 from dm_msgs.action import Autofocus
-from rclpy.node import Node
 
 from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, search_config
 from dm_autofocus.focus_probe import SharpnessSample, raw_image
@@ -31,14 +30,11 @@ _AWAY = (ErrorCode.TIMEOUT, ErrorCode.NODE_INACTIVE, ErrorCode.DRIVER_UNAVAILABL
 TRUSTED = 2.0
 
 
-AUTOFOCUS = Fields(ASKED | {"region": reals([], 0.0, 1.0, sizes=(0, 4))})
-
-
 class AutofocusAction(ProbeAction):
     """Serves `autofocus`."""
 
-    def __init__(self, node: Node, *shared: Any) -> None:
-        super().__init__(node, Autofocus, "autofocus", AUTOFOCUS, *shared)
+    action_type, name = Autofocus, "autofocus"
+    fields = Fields(ASKED | {"region": reals([], 0.0, 1.0, sizes=(0, 4))})
 
     def _plan(self, goal: Any) -> tuple[SearchConfig, Region]:
         capabilities = ready_capabilities(self._probe)
@@ -74,7 +70,7 @@ class AutofocusAction(ProbeAction):
         while not search.current.done:
             step = search.current.step
             try:
-                self._go(goal_handle, step.curvature)
+                self._probe.move(step.curvature)
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
@@ -86,21 +82,21 @@ class AutofocusAction(ProbeAction):
             if not step.measured:
                 search.feed(None)
                 continue
-            phase, sample = search.current.phase, self._measure(goal_handle, region)
+            phase, sample = search.current.phase, self._probe.measure(region)
             search.feed(sample.sharpness, sample.regions)
-            self._report(goal_handle, phase, sample, step.curvature, search.measured, search.steps)
+            self._report(goal_handle, phase, sample, step.curvature, step=search.measured, steps=search.steps)
         if search.reason:
             self._log.info(f"the range was swept: {search.reason}")
         if search.current.peak is None:
             if math.isfinite(before):
-                self._go(goal_handle, before)
+                self._probe.move(before)
             fault = exposure_fault(sample.regions[0]) if sample else ""
             raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
                 f"the range{fault and '; '}{fault}; the mirror is back where it was{self._remarks(search)}",
             )
-        self._go(goal_handle, search.current.step.curvature)
+        self._probe.move(search.current.step.curvature)
         return search.current.peak, search.current.config, self._remarks(search)
 
     def _remarks(self, search: FocusSearch) -> str:
@@ -159,11 +155,11 @@ class AutofocusAction(ProbeAction):
             try:
                 wanted = tracker.step.curvature
                 if wanted != position:
-                    self._go(goal_handle, wanted)
+                    self._probe.move(wanted)
                     position = wanted
-                sample = self._measure(goal_handle, region)
+                sample = self._probe.measure(region)
                 tracker.feed(sample.sharpness, sample.regions, seconds(sample.image.header.stamp))
-                self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
+                self._report(goal_handle, Phase.TRACK, sample, wanted)
                 if tracker.lost:
                     peak, config, _remarks = self._search(goal_handle, config, region)
                     position = peak.curvature
@@ -190,20 +186,11 @@ class AutofocusAction(ProbeAction):
         return Tracker(peak, config, trials)
 
     def _report(
-        self,
-        goal_handle: WorkerGoal,
-        phase: Phase,
-        sample: SharpnessSample,
-        curvature: float,
-        step: int,
-        steps: int,
+        self, goal_handle: WorkerGoal, phase: Phase, sample: SharpnessSample, curvature: float, **progress: int
     ) -> None:
         self._publish(phase, sample)
-        goal_handle.publish_feedback(
-            Autofocus.Feedback(
-                phase=int(phase), step=step, steps=steps, curvature=curvature, sharpness=sample.sharpness
-            )
-        )
+        figures = {"curvature": curvature, "sharpness": sample.sharpness} | progress
+        goal_handle.publish_feedback(Autofocus.Feedback(phase=int(phase), **figures))
 
     def _fill(self, result: Any, peak: Peak) -> None:
         result.curvature, result.power, result.at_limit = peak.curvature, 2 * peak.curvature, peak.at_limit

@@ -51,7 +51,7 @@ def raw_image(message: Image | CompressedImage) -> Image:
 
 
 class FocusProbe:
-    """Moves by `focus_request` and measures on `image_raw`. Methods with a `stop` wait: call them in a worker thread.
+    """Moves by `focus_request` and measures on `image_raw`. What moves or measures waits: call it in a worker thread.
 
     Args:
         node: hosts the topics.
@@ -84,6 +84,7 @@ class FocusProbe:
         self._driver: ActuatorState | None = None
         self.answer: FocusState | None = None
         self.user = ""
+        self._check: Callable[[], None] = lambda: None  # whether the user is to stop
         self.target = math.nan
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, while held [1/m]
@@ -169,12 +170,13 @@ class FocusProbe:
         return f"the action {self.user} is running; cancel it first, or take the mirror over"
 
     @contextmanager
-    def held(self, asked: Any, action: str) -> Iterator[None]:
+    def held(self, asked: Any, action: str, check: Callable[[], None]) -> Iterator[None]:
         """The mirror is that of one action of this node for the block, and held at the driver.
 
         Args:
             asked: its goal, see `MirrorHolder.held`.
             action: its name.
+            check: raises Refusal when it is to stop; called while `move` and `measure` wait.
 
         Raises:
             Refusal: another action or somebody else has it, or there is no driver.
@@ -190,6 +192,7 @@ class FocusProbe:
         self._hold.wait_for(free, asked, self._used(), self._values["move_timeout"])
         self._other_request = None
         self.counted = self.dropped = 0
+        self._check = check
         try:
             with ExitStack() as stack:
                 purpose = f"action {action}; cancel it to end it"
@@ -203,11 +206,11 @@ class FocusProbe:
             self._other_request = None
             self.user = ""
 
-    def move(self, curvature: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Ask for a curvature [1/m] and wait until its shape stands. Returns early when `stop()`.
+    def move(self, curvature: float) -> None:
+        """Ask for a curvature [1/m] and wait until its shape stands.
 
         Raises:
-            Refusal: refused, no answer, another node moves the mirror, or the move does not end.
+            Refusal: refused, no answer, another node moves the mirror, the move does not end, or the user is to stop.
         """
         if self._hold.lost is not None:
             raise self._hold.lost
@@ -219,45 +222,41 @@ class FocusProbe:
         mode, holder, gone = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
         self._request.publish(FocusRequest(curvature=curvature, mode=mode, holder=holder))
         limit = self._values["move_timeout"]
-        if not self._wait(lambda: self.answer is not None, limit, lambda: bool(gone()) or stop()):
-            text = f"no answer to a focus request within {limit:g} s: is focus_controller running?"
-            raise Refusal(ErrorCode.TIMEOUT, text)
+        self._wait(lambda: self.answer is not None or bool(gone()), limit, self._check)
         answer = self.answer
         if answer is None:
-            if not stop() and (reason := gone()):
-                raise Refusal(ErrorCode.TIMEOUT, reason)
-            return
+            text = f"no answer to a focus request within {limit:g} s: is focus_controller running?"
+            raise Refusal(ErrorCode.TIMEOUT, gone() or text)
         if not answer.applied:
             raise Refusal(answer.error_code or ErrorCode.INTERNAL, answer.message)
         with self._changed:
             self._gate.sent(seconds(answer.header.stamp), answer.predicted_duration)
             self._update_gate()
-        if not self._wait(lambda: math.isfinite(self._gate.settled_at), limit, stop):
+        if not self._wait(lambda: math.isfinite(self._gate.settled_at), limit, self._check):
             reason = self._driver.message if self._driver is not None else "no actuator_state from pdm_driver"
             raise Refusal(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
 
-    def measure(self, region: Region, stop: Callable[[], bool] = lambda: False) -> SharpnessSample | None:
-        """Median sharpness of the next images that show the settled shape; None when `stop()`.
+    def measure(self, region: Region) -> SharpnessSample:
+        """Median sharpness of the next images that show the settled shape.
 
         Raises:
-            Refusal: no such image came in time, or it cannot be used.
+            Refusal: no such image came in time, it cannot be used, or the user is to stop.
         """
         samples: list[SharpnessSample] = []
+        limit = self._values["image_timeout"]
         with self._changed:
             self._fresh = None
             self._measuring = True
         try:
             while len(samples) < self._values["images_per_step"]:
-                if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):
-                    limit = self._values["image_timeout"]
+                self._wait(lambda: self._fresh is not None, limit, self._check)
+                with self._changed:
+                    message, self._fresh = self._fresh, None
+                if message is None:
                     newest = None if self.newest is None else seconds(self.newest.header.stamp)
                     reason = self._gate.reason(newest, self._apart, limit)
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
                     raise Refusal(ErrorCode.TIMEOUT, text)
-                with self._changed:
-                    message, self._fresh = self._fresh, None
-                if message is None:
-                    return None
                 samples.append(self.sharpness_of(message, region))
                 self.counted += 1
         finally:
@@ -279,15 +278,18 @@ class FocusProbe:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
         return SharpnessSample(sharpness, image, (part,))
 
-    def await_capabilities(self, timeout_s: float, stop: Callable[[], bool]) -> None:
-        """Wait for the first capabilities, `timeout_s` at most, or for `stop()`."""
-        self._wait(lambda: self.capabilities is not None, timeout_s, stop)
+    def await_capabilities(self, timeout_s: float, check: Callable[[], None]) -> None:
+        """Wait for the first capabilities, `timeout_s` at most. Raises what `check` does meanwhile."""
+        self._wait(lambda: self.capabilities is not None, timeout_s, check)
 
-    def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
-        """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""
+    def _wait(self, condition: Callable[[], bool], timeout_s: float, check: Callable[[], None]) -> bool:
+        """Wait for a condition; False when it was not in time. Raises Refusal as `check`, and on another's move."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while not (condition() or stop()):
+            while True:
+                check()
+                if condition():
+                    return True
                 if self._other_request is not None:
                     raise Refusal(
                         ErrorCode.PREEMPTED,
@@ -295,5 +297,4 @@ class FocusProbe:
                     )
                 if time.monotonic() > deadline:
                     return False
-                self._changed.wait(0.05)  # `stop` gives no notice
-        return True
+                self._changed.wait(0.05)  # `check` gives no notice

@@ -25,7 +25,6 @@ from dm_common.values import Fields, whole
 
 #: Most images of a stack.
 MOST = 1000
-FOCUS_STACK = Fields(ASKED | {"images": whole(0, 0, MOST)})
 #: Percentiles of the distances in the result.
 NEAR, FAR = 5, 95
 
@@ -33,8 +32,11 @@ NEAR, FAR = 5, 95
 class FocusStackAction(ProbeAction):
     """Serves `focus_stack`, and publishes what comes of it."""
 
+    action_type, name = FocusStack, "focus_stack"
+    fields = Fields(ASKED | {"images": whole(0, 0, MOST)})
+
     def __init__(self, node: Node, *shared: Any) -> None:
-        super().__init__(node, FocusStack, "focus_stack", FOCUS_STACK, *shared)
+        super().__init__(node, *shared)
         self._image = node.create_publisher(Image, "focus_stack/image", qos.LATCHED)
         self._depth = node.create_publisher(Image, "focus_stack/depth", qos.LATCHED)
         self._info = node.create_publisher(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
@@ -52,7 +54,7 @@ class FocusStackAction(ProbeAction):
         before = self._probe.curvature
         stack, image = self._sweep(goal_handle, plan)
         if math.isfinite(before):
-            self._go(goal_handle, before)
+            self._probe.move(before)
         try:
             places = stack.in_focus(self._values["search.least_contrast"])
         except ValueError as error:
@@ -75,14 +77,14 @@ class FocusStackAction(ProbeAction):
         image = Image()
         for curvature in plan:
             try:
-                self._go(goal_handle, float(curvature))
+                self._probe.move(float(curvature))
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
                 if stack.positions:
                     break
                 continue
-            sample = self._measure(goal_handle, WHOLE)
+            sample = self._probe.measure(WHOLE)
             image = sample.image
             try:
                 stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))

@@ -11,7 +11,6 @@ from rclpy.node import Node
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics
 from dm_autofocus.search.peak_search import Phase
-from dm_autofocus.sharpness import Region
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_common.values import Fields, real, text, without_figures
@@ -65,32 +64,33 @@ class ProbeAction(ABC):
 
     Args:
         node: hosts the action.
-        action_type, name, fields: of the action.
         probe: moves and measures.
         values: parameters of the node.
         optics: from curvatures to distances, now.
         publish: (phase, sample): publishes an image that counted.
     """
 
+    #: Of the action, and what the fields of its goal may be.
+    action_type: Any
+    name: str
+    fields: Fields
+
     def __init__(
         self,
         node: Node,
-        action_type: Any,
-        name: str,
-        fields: Fields,
         probe: FocusProbe,
         values: Mapping[str, Any],
         optics: Callable[[], FocusOptics],
         publish: Callable[[Phase, SharpnessSample], None],
     ) -> None:
         self._log = node.get_logger()
-        self._type = action_type
-        self._name = name
         self._probe = probe
         self._values = values
         self._optics = optics
         self._publish = publish
-        self._server = WorkerActionServer(node, action_type, name, self._run, exclusive="preempt", fields=fields)
+        self._server = WorkerActionServer(
+            node, self.action_type, self.name, self._run, exclusive="preempt", fields=self.fields
+        )
 
     @abstractmethod
     def _plan(self, goal: Any) -> Any:
@@ -102,13 +102,19 @@ class ProbeAction(ABC):
 
     def _run(self, goal_handle: WorkerGoal) -> tuple[str, Any]:
         started = time.monotonic()
-        result = without_figures(self._type.Result())  # until they are known
+        result = without_figures(self.action_type.Result())  # until they are known
         outcome = "succeed"
+
+        def check() -> None:
+            if goal_handle.is_cancel_requested:
+                raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
+            if self._server.preempted(goal_handle):
+                raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
+
         try:
-            self._probe.await_capabilities(START_GRACE_S, lambda: self._stopping(goal_handle))
-            self._check_stop(goal_handle)
+            self._probe.await_capabilities(START_GRACE_S, check)
             plan = self._plan(goal_handle.request)
-            with self._probe.held(goal_handle.request, self._name):
+            with self._probe.held(goal_handle.request, self.name, check):
                 try:
                     self._carry_out(goal_handle, plan, result)
                 finally:
@@ -118,22 +124,3 @@ class ProbeAction(ABC):
             result.error_code, result.message = error.error_code, str(error)
         result.duration = time.monotonic() - started
         return outcome, result
-
-    def _go(self, goal_handle: WorkerGoal, curvature: float) -> None:
-        self._probe.move(curvature, lambda: self._stopping(goal_handle))
-        self._check_stop(goal_handle)
-
-    def _measure(self, goal_handle: WorkerGoal, region: Region) -> SharpnessSample:
-        sample = self._probe.measure(region, lambda: self._stopping(goal_handle))
-        self._check_stop(goal_handle)
-        assert sample is not None  # only a stop leaves without one
-        return sample
-
-    def _stopping(self, goal_handle: WorkerGoal) -> bool:
-        return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
-
-    def _check_stop(self, goal_handle: WorkerGoal) -> None:
-        if goal_handle.is_cancel_requested:
-            raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
-        if self._server.preempted(goal_handle):
-            raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
