@@ -9,7 +9,6 @@ on either side: where the pupil is not ideal, what one side says is wrong by as 
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,9 @@ from dm_autofocus.search.defocus_model import TRANSFER_ERROR, DefocusModel, Floa
 from dm_autofocus.search.peak_search import (
     MOST_REFUSALS,
     NOISE_POINTS,
-    RETREAT,
     Peak,
     Phase,
+    Search,
     SearchConfig,
     Step,
     is_hill,
@@ -53,8 +52,8 @@ WORST, RECENTRED = 1.5, 3
 BLURRED, ERROR = 1.25, 0.17
 
 
-class DepthFromDefocus:
-    """One search from beginning to end, or to where it gives up.
+class DepthFromDefocus(Search):
+    """A search by few images, to its end or to where it gives up.
 
     Args:
         config: range and tolerance.
@@ -62,19 +61,11 @@ class DepthFromDefocus:
         start: where the mirror stands [1/m]; NaN = not known.
 
     Attributes:
-        step: where to measure next; after the end, the curvature to stand at.
-        config: as given, the range as far as it was not refused.
-        phase: COARSE, or FINE from where a place is being confirmed.
-        done: nothing more is to be fed.
-        peak: what was found; None while it runs, when it gave up, and when there is nothing to see.
         gave_up: the reason why the images cannot be explained; "" = they can.
     """
 
     def __init__(self, config: SearchConfig, model: DefocusModel, start: float) -> None:
-        self.config = config
-        self.phase = Phase.COARSE
-        self.done = False
-        self.peak: Peak | None = None
+        super().__init__(config)
         self.gave_up = ""
         self._model = model
         tolerance = config.tolerance
@@ -82,7 +73,6 @@ class DepthFromDefocus:
         self._places: list[float] = []
         self._powers: list[Floats] = []
         self._sharpness: list[float] = []
-        self._refusals = 0
         self._evidence = 0.0
         self._blind = 0  # images until the last that left it open whether focus changes anything
         quarter = (config.high - config.low) / 4
@@ -111,16 +101,7 @@ class DepthFromDefocus:
         Raises:
             ValueError: hardly anything of the range is left.
         """
-        config, here = self.config, self.step.curvature
-        step = RETREAT * (config.high - config.low)
-        if here < (config.low + config.high) / 2:
-            self.config = replace(config, low=here + step)
-        else:
-            self.config = replace(config, high=here - step)
-        low, high = self.config.low, self.config.high
-        if high - low < 2 * config.tolerance:
-            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
-        self.step = Step(float(np.clip(here, low, high)))
+        self.step = Step(float(np.clip(self.step.curvature, *self._draw_in())))
         self._refusals += 1
         if self._refusals > MOST_REFUSALS:
             self._give_up("the mirror refuses too much of the range")

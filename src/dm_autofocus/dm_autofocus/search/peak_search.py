@@ -107,27 +107,56 @@ class Peak:
     error: float = math.nan
 
 
-class PeakSearch:
-    """One search from beginning to end.
+class Search:
+    """One search from beginning to end: what all have in common.
 
     Attributes:
         step: where to measure next; after the end, the curvature to stand at.
         config: as given, the range as far as it was not refused.
-        phase: COARSE or FINE.
+        phase: COARSE, or FINE from where a place is being confirmed.
         done: nothing more is to be fed.
-        peak: what was found; None while it runs, and at its end when there was no hill.
-        measured: positions measured so far.
+        peak: what was found; None while it runs, and at its end when there was nothing to see.
     """
+
+    step: Step
 
     def __init__(self, config: SearchConfig) -> None:
         self.config = config
         self.phase = Phase.COARSE
         self.done = False
         self.peak: Peak | None = None
+        self._refusals = 0
+
+    def _draw_in(self, first: float = -math.inf, last: float = math.inf) -> tuple[float, float]:
+        """Have the range end before `step`, which the mirror refused; what of it lies from `first` to `last` [1/m].
+
+        Raises:
+            ValueError: hardly anything.
+        """
+        config, here = self.config, self.step.curvature
+        retreat = RETREAT * (config.high - config.low)
+        if here < (config.low + config.high) / 2:
+            self.config = replace(config, low=here + retreat)
+        else:
+            self.config = replace(config, high=here - retreat)
+        low, high = max(first, self.config.low), min(last, self.config.high)
+        if high - low < 2 * config.tolerance:
+            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
+        return low, high
+
+
+class PeakSearch(Search):
+    """A search by sweeps, to be fed sharpness.
+
+    Attributes:
+        measured: positions measured so far.
+    """
+
+    def __init__(self, config: SearchConfig) -> None:
+        super().__init__(config)
         self.measured = 0
-        self.step: Step
         self._positions: np.ndarray
-        self._shifts = self._refusals = 0
+        self._shifts = 0
         self._coarse = np.empty(0)  # what the first sweep saw, until the next has confirmed it
         self._begin(config.low, config.high, config.coarse_points)
 
@@ -135,10 +164,8 @@ class PeakSearch:
         """Report the sharpness at `step`; None when it was not to be measured.
 
         Raises:
-            ValueError: no finite number where one is needed, or the search is done.
+            ValueError: no finite number where one is needed.
         """
-        if self.done:
-            raise ValueError("sharpness: the search is done, it takes no more")
         if not self.step.measured:
             if self.phase is Phase.FINE and self.peak is not None:
                 self.step = Step(self.peak.curvature)
@@ -171,15 +198,7 @@ class PeakSearch:
             self._positions = self._positions[:seen]
             self._judge(np.array(self._seen))
             return
-        give_up = RETREAT * (config.high - config.low)
-        middle = (config.low + config.high) / 2
-        if self.step.curvature < middle:
-            self.config = replace(config, low=config.low + give_up)
-        else:
-            self.config = replace(config, high=config.high - give_up)
-        low, high = max(float(self._positions[0]), self.config.low), min(float(self._positions[-1]), self.config.high)
-        if self.done or high - low < 2 * config.tolerance:
-            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
+        low, high = self._draw_in(float(self._positions[0]), float(self._positions[-1]))
         self.peak = None
         self._begin(low, high, len(self._positions))
 
