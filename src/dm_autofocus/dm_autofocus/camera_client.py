@@ -134,18 +134,9 @@ class CameraFocusClient(DeformableMirrorClient):
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         topics = ("focus_stack/image", "focus_stack/depth")
         for topic in topics:
-            if topic not in self.messages:
-                self.messages[topic] = None
-                self.hear(topic, Image, qos.LATCHED)
+            self.hear(topic, Image, qos.LATCHED)
         result = self.run_action("focus_stack", goal, on_feedback, timeout_s)
-
-        def arrived() -> bool:
-            pictures = [self.messages[topic] for topic in topics]
-            return all(picture is not None and picture.header.stamp == result.stamp for picture in pictures)
-
-        if not self.wait(arrived):
-            raise DeformableMirrorError(ErrorCode.TIMEOUT, "the images did not arrive on focus_stack/image and depth")
-        image, depth = (pixels_of(self.messages[topic]) for topic in topics)
+        image, depth = (pixels_of(self.stamped(topic, result.stamp)) for topic in topics)
         return result, image, depth[..., 0]
 
     def boresight(self, region: Sequence[float], *, pairs: int = 6, **claim: Unpack[Claim]) -> Boresight:
@@ -166,9 +157,7 @@ class CameraFocusClient(DeformableMirrorClient):
         focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
         topics = {"image_raw": Image, "image_raw/compressed": CompressedImage}
         for topic, kind in topics.items():
-            if topic not in self.messages:
-                self.messages[topic] = None
-                self.hear(topic, kind, IMAGES)
+            self.hear(topic, kind, IMAGES)
 
         def see(curvature: float, tilt: NDArray[np.float64]) -> NDArray:
             zernike = np.zeros(len(TERMS))
@@ -177,7 +166,7 @@ class CameraFocusClient(DeformableMirrorClient):
             begin = seconds_of(state.header.stamp) + state.predicted_duration + SETTLE_S
 
             def fresh() -> list[Any]:
-                came = [self.messages[topic] for topic in topics if self.messages[topic] is not None]
+                came = [self.messages[topic] for topic in topics if topic in self.messages]
                 return [image for image in came if seconds_of(image.header.stamp) >= begin]
 
             if not self.wait(lambda: bool(fresh())):

@@ -183,21 +183,12 @@ class DeformableMirrorClient(Connection):
 
     def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
-        if "surface_map" not in self.messages:
-            self.hear("surface_map", Image, qos.MAP)
+        if self.hear("surface_map", Image, qos.MAP):
             self.hear("surface_map_info", SurfaceMapInfo, qos.MAP)
-            self.messages["surface_map"] = None
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
             time.sleep(0.3)  # the publisher must have discovered this subscription too
         response = self.measure(label, timeout_s)
-
-        def arrived() -> bool:
-            image = self.messages["surface_map"]
-            return image is not None and image.header.stamp == response.info.header.stamp
-
-        if not self.wait(arrived):
-            raise DeformableMirrorError(ErrorCode.MAP_TIMEOUT, "the map did not arrive on surface_map")
-        return response, self.messages["surface_map"]
+        return response, self.stamped("surface_map", response.info.header.stamp, ErrorCode.MAP_TIMEOUT)
 
     def list_calibrations(self) -> ListCalibrations.Response:
         """Calibrations in the store, newest first."""

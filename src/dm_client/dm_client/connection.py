@@ -106,6 +106,7 @@ class Connection:
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node(f"{name}_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
         self.messages: dict[str, Any] = {}
+        self._heard: set[str] = set()
         self._on_message, self._timeout_s = on_message, timeout_s
         self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
@@ -128,14 +129,18 @@ class Connection:
             self._background.destroy_node()
         self._context.try_shutdown()
 
-    def hear(self, topic: str, message_type: Any, profile: Any) -> None:
-        """Keep the latest message of a topic from now on."""
+    def hear(self, topic: str, message_type: Any, profile: Any) -> bool:
+        """Keep the latest message of a topic from now on; False = it is kept already."""
+        if topic in self._heard:
+            return False
+        self._heard.add(topic)
 
         def take(message: Any) -> None:
             self.messages[topic] = message
             self._on_message(topic, message)
 
         self.node.create_subscription(message_type, topic, take, profile)
+        return True
 
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
         """Wait until `condition()` is true; False when it was not in time."""
@@ -145,6 +150,17 @@ class Connection:
                 return False
             time.sleep(0.005)
         return True
+
+    def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
+        """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
+
+        def arrived() -> bool:
+            message = self.messages.get(topic)
+            return message is not None and message.header.stamp == stamp
+
+        if not self.wait(arrived):
+            raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
+        return self.messages[topic]
 
     def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
