@@ -74,7 +74,10 @@ class AutofocusAction(ProbeAction):
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
-                self._draw_in(search, error)
+                try:
+                    search.refuse()
+                except ValueError as reason:
+                    raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
                 continue
             if search.current.config.approach < approach and (doubt := self._doubt()):
                 search.sweep(doubt, approach)
@@ -140,12 +143,6 @@ class AutofocusAction(ProbeAction):
         if curvature_of_defocus(bound, radius) < TRUSTED * depth_of_focus(radius, self._values["optics.wavelength"]):
             return ""
         return f"moves may err by {bound * 1e9:.0f} nm"
-
-    def _draw_in(self, search: FocusSearch, error: Refusal) -> None:
-        try:
-            search.refuse()
-        except ValueError as reason:
-            raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
 
     def _track(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region, peak: Peak, result: Any) -> None:
         """Stay on the peak until cancelled or pre-empted: ends by Refusal only, and not for a controller that died."""

@@ -68,8 +68,8 @@ class AutofocusNode(ManagedNode):
                 ErrorCode.INVALID_ARGUMENT,
                 f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
             )
-        if not (request.take_over or request.dry_run):
-            self._probe.refuse_if_used()
+        if self._probe.user and not (request.take_over or request.dry_run):
+            raise self._probe.busy()
         response.dioptre = dioptre_of(request.distance) or request.dioptre
         response.distance = distance_of(response.dioptre)
         response.curvature = self._optics.curvature_for(response.dioptre)

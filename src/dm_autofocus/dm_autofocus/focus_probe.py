@@ -8,7 +8,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,13 +161,9 @@ class FocusProbe:
 
     # --- moving and measuring ---
 
-    def refuse_if_used(self) -> None:
-        """Raise Refusal while an action of this node holds the mirror."""
-        if self.user:
-            raise Refusal(ErrorCode.BUSY, self._used())
-
-    def _used(self) -> str:
-        return f"the action {self.user} is running; cancel it first, or take the mirror over"
+    def busy(self) -> Refusal:
+        """Of what would move the mirror while an action of this node holds it."""
+        return Refusal(ErrorCode.BUSY, f"the action {self.user} is running; cancel it first, or take the mirror over")
 
     @contextmanager
     def held(self, asked: Any, action: str, check: Callable[[], None]) -> Iterator[None]:
@@ -189,18 +185,16 @@ class FocusProbe:
                 self.user = action
                 return True
 
-        self._hold.wait_for(free, asked, self._used(), self._values["move_timeout"])
+        self._hold.wait_for(free, asked, str(self.busy()), self._values["move_timeout"])
         self._other_request = None
         self.counted = self.dropped = 0
         self._check = check
+        purpose = f"action {action}; cancel it to end it"
         try:
-            with ExitStack() as stack:
-                purpose = f"action {action}; cancel it to end it"
-                try:
-                    stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
-                except ServiceCallError as error:
-                    raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
+            with self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]):
                 yield
+        except ServiceCallError as error:
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
         finally:
             self.target = math.nan
             self._other_request = None
