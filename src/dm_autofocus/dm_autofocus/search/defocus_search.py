@@ -80,16 +80,12 @@ class DepthFromDefocus(Search):
         self._first = (above, below) if abs(start - above) < abs(start - below) else (below, above)
         self.step = Step(self._first[0])
 
-    @property
-    def measured(self) -> int:
-        """Images so far."""
-        return len(self._places)
-
     def feed(self, sharpness: float, powers: Floats) -> None:
         """Report the sharpness of an image at `step` and its powers (K,), see `DefocusModel.powers`."""
         self._places.append(self.step.curvature)
         self._sharpness.append(sharpness)
         self._powers.append(powers)
+        self.measured += 1
         if self.measured < 2:
             self.step = Step(self._first[1])
         else:

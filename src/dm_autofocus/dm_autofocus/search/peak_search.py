@@ -116,6 +116,7 @@ class Search:
         phase: COARSE, or FINE from where a place is being confirmed.
         done: nothing more is to be fed.
         peak: what was found; None while it runs, and at its end when there was nothing to see.
+        measured: positions measured so far.
     """
 
     step: Step
@@ -125,6 +126,7 @@ class Search:
         self.phase = Phase.COARSE
         self.done = False
         self.peak: Peak | None = None
+        self.measured = 0
         self._refusals = 0
 
     def _draw_in(self, first: float = -math.inf, last: float = math.inf) -> tuple[float, float]:
@@ -146,15 +148,10 @@ class Search:
 
 
 class PeakSearch(Search):
-    """A search by sweeps, to be fed sharpness.
-
-    Attributes:
-        measured: positions measured so far.
-    """
+    """A search by sweeps, to be fed sharpness."""
 
     def __init__(self, config: SearchConfig) -> None:
         super().__init__(config)
-        self.measured = 0
         self._positions: np.ndarray
         self._shifts = 0
         self._coarse = np.empty(0)  # what the first sweep saw, until the next has confirmed it
