@@ -19,17 +19,7 @@ PARAMETERS: Final = (
         real(0.0, 0.0, 1e6, "m"),
         "Object distance in focus while the mirror is flat; 0 = infinity. See docs/camera.md.",
     ),
-    Parameter(
-        "optics.relay_magnification",
-        real(1.0, 0.01, 100.0),
-        "Diameter of the beam on the mirror / diameter of the entrance pupil.",
-    ),
-    Parameter("optics.incidence", real(0.0, 0.0, math.pi / 3, "rad"), "Angle of incidence on the mirror."),
-    Parameter(
-        "optics.pupil_offset",
-        real(0.0, -100.0, 100.0, "m"),
-        "How far the entrance pupil lies behind the point that object distances count from.",
-    ),
+    *parameters_of("optics.", FocusOptics),
     Parameter("optics.wavelength", real(550e-9, 1e-7, 2e-5, "m"), "Mean wavelength of the images."),
     Parameter(
         "optics.focal_length_px",
@@ -97,12 +87,8 @@ def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
         ValueError: they make no sense, or the region does not lie in the image.
     """
     check_region(values["region"])
-    return FocusOptics.from_rest_distance(
-        values["optics.rest_distance"],
-        values["optics.relay_magnification"],
-        values["optics.incidence"],
-        values["optics.pupil_offset"],
-    )
+    others = {name: values[f"optics.{name}"] for name in ("relay_magnification", "incidence", "pupil_offset")}
+    return FocusOptics.from_rest_distance(values["optics.rest_distance"], **others)
 
 
 def tolerance_of(values: Mapping[str, Any], aperture_radius: float) -> float:

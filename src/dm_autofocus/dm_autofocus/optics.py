@@ -21,13 +21,14 @@ x curvature. Source: [2], sections 4.4 and 4.6 (oblique powers by Coddington).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.errors import CodedError, ErrorCode
+from dm_common.values import parameter, real
 
 
 class OpticsError(CodedError, ValueError):
@@ -42,18 +43,21 @@ class FocusOptics:
 
     Attributes:
         rest_dioptre: V, vergence at the mirror that is in focus while the mirror is flat [1/m].
-        relay_magnification: m, diameter of the beam on the mirror / diameter of the entrance pupil.
-        incidence: angle of incidence on the mirror [rad], 0 <= incidence < pi/2.
-        pupil_offset: how far the entrance pupil lies behind the point that object distances count from [m].
+        relay_magnification, incidence, pupil_offset: m, the angle i [rad] and a length [m], see the parameters.
 
     Raises:
-        OpticsError: a value that is not finite or outside its range.
+        OpticsError: a value that is not finite, a magnification that is not above 0, or an angle from pi/2 on.
     """
 
     rest_dioptre: float = 0.0
-    relay_magnification: float = 1.0
-    incidence: float = 0.0
-    pupil_offset: float = 0.0
+    relay_magnification: float = parameter(
+        real(1.0, 0.01, 100.0), "Diameter of the beam on the mirror / diameter of the entrance pupil."
+    )
+    incidence: float = parameter(real(0.0, 0.0, math.pi / 3, "rad"), "Angle of incidence on the mirror.")
+    pupil_offset: float = parameter(
+        real(0.0, -100.0, 100.0, "m"),
+        "How far the entrance pupil lies behind the point that object distances count from.",
+    )
 
     def __post_init__(self) -> None:
         for name in ("rest_dioptre", "pupil_offset"):
@@ -65,21 +69,18 @@ class FocusOptics:
             raise OpticsError(f"incidence = {self.incidence} rad: must be from 0 to below pi/2")
 
     @classmethod
-    def from_rest_distance(
-        cls,
-        rest_distance: float,
-        relay_magnification: float = 1.0,
-        incidence: float = 0.0,
-        pupil_offset: float = 0.0,
-    ) -> FocusOptics:
+    def from_rest_distance(cls, rest_distance: float, **others: float) -> FocusOptics:
         """The optics of a camera that is in focus at `rest_distance` (m, 0 or inf = infinity) while the mirror is flat.
 
+        Args:
+            others: the attributes other than `rest_dioptre`.
+
         Raises:
-            OpticsError: see `pupil_dioptre` and the class.
+            OpticsError: an object inside the camera, and see the class.
         """
-        blank = cls(0.0, relay_magnification, incidence, pupil_offset)
+        blank = cls(**others)
         rest = blank._pupil_dioptre(dioptre_of(rest_distance, "rest_distance"))
-        return cls(rest / relay_magnification**2, relay_magnification, incidence, pupil_offset)
+        return replace(blank, rest_dioptre=rest / blank.relay_magnification**2)
 
     def curvature_for(self, dioptre: float) -> float:
         """Curvature [1/m] that focuses on the dioptre 1 / distance [1/m]; below 0 = beyond infinity.
