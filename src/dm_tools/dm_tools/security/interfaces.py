@@ -144,28 +144,18 @@ def interfaces(simulation: bool = False, sensor: str = "") -> tuple[NodeInterfac
     suite = {node.name: node for node in NODES}
     found = []
     for node in _DECLARED:
-        enclave = node.enclave or node.name
-        publish, subscribe = {*node.publish, *LOGS}, {*node.subscribe}
-        reply = {*node.reply, *PARAMETER_SERVICES}
         if node.name == "virtual_bench" and not simulation:
             continue
+        enclave = node.enclave or node.name
+        publish, subscribe, reply = node.publish + LOGS, node.subscribe, node.reply + PARAMETER_SERVICES
         if node.name in suite:
-            publish.add(HEALTH)
+            publish += (HEALTH,)
             if suite[node.name].lifecycle:
-                publish.add("~/transition_event")
-                reply.update(LIFECYCLE_SERVICES)
+                publish += ("~/transition_event",)
+                reply += LIFECYCLE_SERVICES
         if node.name == "interferometer" and sensor:
-            subscribe.add(sensor)
+            subscribe += (sensor,)
         if simulation and enclave in suite and enclave != "virtual_bench":  # they go by simulated time
-            subscribe.add(CLOCK)
-        found.append(
-            replace(
-                node,
-                publish=tuple(sorted(publish)),
-                subscribe=tuple(sorted(subscribe)),
-                reply=tuple(sorted(reply)),
-                request=tuple(sorted(node.request)),
-                enclave=enclave,
-            )
-        )
+            subscribe += (CLOCK,)
+        found.append(replace(node, publish=publish, subscribe=subscribe, reply=reply, enclave=enclave))
     return tuple(found)

@@ -97,7 +97,7 @@ def policy_xml(profile: Profile, enclave: str) -> str:
             for rule in rules:
                 if names := getattr(node, rule):
                     listed = xml.SubElement(one, f"{element}s", {rule: "ALLOW"})
-                    for name in names:
+                    for name in sorted(set(names)):
                         xml.SubElement(listed, element).text = name
     return _text(policy)
 
