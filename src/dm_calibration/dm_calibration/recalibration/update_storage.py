@@ -66,8 +66,6 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         columns, attributes = read_image(path)
     except ImageError as error:
         raise UpdatesFileError(f"{path.name}: {error}") from error
-    except OSError as error:
-        raise UpdatesFileError(f"{path.name}: cannot be read: {error.strerror or error}") from error
     wanted = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "calibration": identifier, "basis_sha256": basis}
     for name, value in wanted.items():
         if attributes.get(name) != value:

@@ -57,8 +57,12 @@ class CalibrationStore:
 
         Raises:
             StoreError: disk full, read-only, id taken, ...; the folder is as it was.
+            ValueError: an id that is no safe file stem.
         """
-        check_id(calibration.id)
+        if not _ID.fullmatch(calibration.id):
+            raise ValueError(
+                f"calibration id {calibration.id!r}: letters, digits, '.', '_', '-', at most 128, no leading dot"
+            )
         target = self._file(calibration.id)
         if target.exists():
             raise StoreError(f"calibration {calibration.id} exists already; it is not overwritten")
@@ -97,8 +101,6 @@ class CalibrationStore:
             calibration = from_columns(*read_image(file))
         except (ImageError, CalibrationFileError) as error:
             raise CalibrationFileError(f"{file.name}: {error}") from error
-        except OSError as error:
-            raise CalibrationFileError(f"{file.name}: cannot be read: {error.strerror or error}") from error
         if calibration.id != file.name.removesuffix(SUFFIX):
             raise CalibrationFileError(f"{file.name}: holds the calibration {calibration.id}; was the file renamed?")
         return calibration
@@ -143,12 +145,6 @@ class CalibrationStore:
 
     def _file(self, identifier: str) -> Path:
         return self.folder / f"{identifier}{SUFFIX}"
-
-
-def check_id(identifier: str) -> None:
-    """Raise ValueError unless `identifier` is a safe file stem."""
-    if not _ID.fullmatch(identifier):
-        raise ValueError(f"calibration id {identifier!r}: letters, digits, '.', '_', '-', at most 128, no leading dot")
 
 
 def raw_hash(calibration: Calibration) -> str:

@@ -63,14 +63,16 @@ def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
     datasets are read: links out of the file, virtual and external storage are refused.
 
     Raises:
-        ImageError: not HDF5, truncated, damaged, not plain, or the hash does not agree.
-        OSError: the file cannot be opened at all.
+        ImageError: it cannot be read, is not HDF5, truncated, damaged, not plain, or the hash does not agree.
     """
-    with path.open("rb") as raw:
-        size = os.fstat(raw.fileno()).st_size
-        if size > SIZE_MAX:
-            raise ImageError(f"{size} bytes: a calibration has at most {SIZE_MAX}")
-        content = raw.read(size)
+    try:
+        with path.open("rb") as raw:
+            size = os.fstat(raw.fileno()).st_size
+            if size > SIZE_MAX:
+                raise ImageError(f"{size} bytes: a calibration has at most {SIZE_MAX}")
+            content = raw.read(size)
+    except OSError as error:
+        raise ImageError(f"cannot be read: {error.strerror or error}") from error
     if size < SUPERBLOCK:  # the library would read on into whatever lies behind
         raise ImageError(f"not a whole HDF5 file: {size} bytes, must be {SUPERBLOCK} at least")
     try:
