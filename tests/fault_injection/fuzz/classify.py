@@ -39,7 +39,7 @@ class Verdict(StrEnum):
     OTHER_HEADER = "H"
     WRONG_MAP = "W"
     EXCEPTION = "E"
-    HYSTERESIS = "M"
+    MEMORY = "M"
 
 
 def classify(file: ReferenceFile, whole: SurfaceMap, mutation: Mutation, found: SurfaceMap) -> Verdict:

@@ -63,7 +63,7 @@ class FuzzResult:
         self.other_samples += verdicts[Verdict.OTHER_SAMPLES]
         self.other_header += verdicts[Verdict.OTHER_HEADER]
         self.wrong_maps += verdicts[Verdict.WRONG_MAP]
-        self.crashes += verdicts[Verdict.EXCEPTION] + verdicts[Verdict.HYSTERESIS]
+        self.crashes += verdicts[Verdict.EXCEPTION] + verdicts[Verdict.MEMORY]
 
 
 def fuzz(

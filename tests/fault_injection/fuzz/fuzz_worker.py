@@ -23,7 +23,7 @@ from fault_injection.fuzz.mutations import Mutation, mutate
 from fault_injection.fuzz.reference_files import CALIBRATION_ID, XYZ_UNIT, ReferenceFile, reference_file
 
 #: Address space that a reader may take beyond what this process had before the first damaged file [bytes].
-HYSTERESIS = 256 << 20
+MEMORY = 256 << 20
 
 Reader = Callable[[Mutation], tuple[Verdict, str]]
 
@@ -69,7 +69,7 @@ def _refused(error: BaseException) -> tuple[Verdict, str]:
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError):
-            return Verdict.HYSTERESIS, str(error)
+            return Verdict.MEMORY, str(error)
         cause = cause.__cause__ or cause.__context__
     return Verdict.REFUSED, ""
 
@@ -77,7 +77,7 @@ def _refused(error: BaseException) -> tuple[Verdict, str]:
 def limit_memory() -> None:
     """From now on this process may take MEMORY more than it has."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * os.sysconf("SC_PAGE_SIZE") + HYSTERESIS
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
@@ -95,10 +95,10 @@ def main(arguments: list[str]) -> int:
             try:
                 verdict, words = read(mutation)
             except MemoryError as error:
-                verdict, words = Verdict.HYSTERESIS, f"MemoryError: {error}"
+                verdict, words = Verdict.MEMORY, f"MemoryError: {error}"
             except Exception as error:
                 verdict, words = Verdict.EXCEPTION, f"{type(error).__name__}: {error}"
-            if verdict in (Verdict.WRONG_MAP, Verdict.EXCEPTION, Verdict.HYSTERESIS):
+            if verdict in (Verdict.WRONG_MAP, Verdict.EXCEPTION, Verdict.MEMORY):
                 entry = {"format": name, "number": number, "mutation": mutation.kind, "verdict": verdict.name}
                 findings.write(json.dumps(entry | {"words": words[:500]}) + "\n")
                 findings.flush()

@@ -18,7 +18,7 @@ from dm_calibration.store.hdf5_image import ImageError, parse_image
 from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, receive, send
 
 #: Address space beyond what the process has at its start and the file itself: the largest map, and a copy in work.
-HYSTERESIS = 3 * 8 * MAX_PIXELS
+MEMORY = 3 * 8 * MAX_PIXELS
 
 Found = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -48,7 +48,7 @@ def limit(length: int) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = math.ceil(used.ru_utime + used.ru_stime + CPU_BASE_S + length * CPU_PER_BYTE_S)
     _lower(resource.RLIMIT_CPU, seconds)
-    _lower(resource.RLIMIT_AS, _AT_START + HYSTERESIS + 2 * length)
+    _lower(resource.RLIMIT_AS, _AT_START + MEMORY + 2 * length)
 
 
 def _lower(kind: int, value: int) -> None:
