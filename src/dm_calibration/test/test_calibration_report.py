@@ -30,7 +30,7 @@ from dm_calibration.report.checks import next_calibration
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
-from dm_calibration.report.html_page import one_html
+from dm_calibration.report.html_page import html_page
 from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
@@ -134,12 +134,12 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     keep_people({"instrument": "Verifire"}, file)
     keep_people({}, file)
     hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
-    text = one_html("", [certificate(replace(calibration, hysteresis=hysteresis), people(file))])
+    text = html_page("", [certificate(replace(calibration, hysteresis=hysteresis), people(file))])
     for expected in ("<td>calibrated</td>", "2.80 nm (λ/226), 95 % bound", "A. N. Other", "Verifire"):
         assert expected in text
     assert "absolute not known (instrument_error and scale_error of the interferometer not given)" in text
     known = replace(calibration, reference_surface="flat.dat, SHA-256 01", instrument_error=5e-9, scale_error=1e-4)
-    absolute = one_html("", [certificate(known, {})])
+    absolute = html_page("", [certificate(known, {})])
     assert "flat.dat, SHA-256 01" in absolute and " nm, limited by" in absolute.partition("absolute to ")[2][:20]
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
     assert "actuators 1 are dead" in replace(calibration, fit=dead).doubts()[0]
@@ -158,7 +158,7 @@ def test_message_and_certificate_agree(
     judged = replace(calibration, fit=replace(calibration.fit, grades=grades, held_out_max_zernike=promised))
     message = calibration_message(judged, None, "mirror", error_max)
     assert (message.quality == Capabilities.CALIBRATED) is good
-    assert ("<td>calibrated</td>" in one_html("", [certificate(judged, {}, (), error_max)])) is good
+    assert ("<td>calibrated</td>" in html_page("", [certificate(judged, {}, (), error_max)])) is good
 
 
 def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibration, tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibrat
     drift = updates.in_use.drift
     drift = replace(drift, stuck=np.where(np.arange(37) == 4, -1.0, drift.stuck), surprising=3)
     write_updates(tmp_path / f"{calibration.id}{SUFFIX}", calibration.id, updates.in_use.basis, drift)
-    first = one_html("", sections(calibration, file)[:1])
+    first = html_page("", sections(calibration, file)[:1])
     for expected in (
         "approximate:",
         "calibrate again; Goes on without actuator 5 (stands at -1.00)</td>",
@@ -250,7 +250,7 @@ def test_hysteresis_and_recipes_are_shown(calibration: Calibration) -> None:
     recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4, astigmatism)
     whole = replace(calibration, hysteresis=hysteresis, recipes=RecipeBook((recipe,), 100, 0.8e-9, 10**18))
     made = [content.summary(whole), content_hysteresis.hysteresis(whole), content_hysteresis.recipes(whole)]
-    text = one_html("", made)
+    text = html_page("", made)
     for expected in (
         "11.1% of the span",
         "1.00% of a step per decade",
@@ -276,7 +276,7 @@ def test_actuators_with_laws_of_their_own_have_loops_of_their_own(calibration: C
     own = replace(PLAY, play_weight=np.array([1.0, 0.0])[:, None] + share[:, None, None] * [[0.0], [1.0]])
     np.testing.assert_allclose(loop_opening(own), 0.4 * share / (2.0 + 1.6 * share))
     hysteresis = HysteresisFit("Preisach, each actuator its own", own, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
-    text = one_html("", [content_hysteresis.hysteresis(replace(calibration, hysteresis=hysteresis))])
+    text = html_page("", [content_hysteresis.hysteresis(replace(calibration, hysteresis=hysteresis))])
     assert "7.1% to 13.6% over the actuators" in text and "the mean over actuators" in text
 
 

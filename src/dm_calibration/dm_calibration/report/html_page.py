@@ -48,17 +48,12 @@ $sections
 """)
 
 
-def one_html(title: str, sections: Sequence[Section]) -> str:
-    """The page as one file, with its pictures inside."""
-    return html_page(
-        title,
-        sections,
-        lambda picture: f"data:image/png;base64,{base64.b64encode(picture.png).decode('ascii')}",
-    )
+def _as_data(picture: Picture) -> str:
+    return f"data:image/png;base64,{base64.b64encode(picture.png).decode('ascii')}"
 
 
-def html_page(title: str, sections: Sequence[Section], place: Callable[[Picture], str]) -> str:
-    """The page; `place` puts a picture somewhere and returns its address."""
+def html_page(title: str, sections: Sequence[Section], place: Callable[[Picture], str] = _as_data) -> str:
+    """The page; `place` puts a picture somewhere and returns its address. By default they are inside, all one file."""
     parts, links = [], []
     for number, section in enumerate(sections, start=1):
         links.append(f'<a href="#s{number}">{escape(section.title)}</a>')

@@ -13,7 +13,7 @@ from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOpt
 from dm_calibration.report import certificate, checks, content, content_fit, content_hysteresis
 from dm_calibration.report.content_hysteresis import loop_opening
 from dm_calibration.report.document import Section
-from dm_calibration.report.html_page import one_html
+from dm_calibration.report.html_page import html_page
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_common.atomic_write import write_whole
@@ -75,7 +75,7 @@ def write_report(
     made = sections(calibration, file, error_max)
     title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
     written = Written(folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf")
-    write_whole(written.html, one_html(title, made).encode())
+    write_whole(written.html, html_page(title, made).encode())
     write_whole(written.pdf, pdf_pages(title, made))
     return written
 
