@@ -17,13 +17,14 @@ from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.lifecycle import ManagedNode
+from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_common.values import without_figures
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
+from dm_controller.focus_messages import health
 from dm_controller.focus_parameters import MOVE_FOCUS
 from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
 
@@ -36,7 +37,7 @@ START_S = 3.0
 
 
 class FocusHost(ManagedNode, ABC):
-    """The node as services, actions and its lifecycle see it: one thread at a time has the controller.
+    """The services, actions and lifecycle of the node: one thread at a time has the controller.
 
     Args:
         name, table, on_change, keywords: see `ManagedNode`.
@@ -52,6 +53,11 @@ class FocusHost(ManagedNode, ABC):
         super().__init__(name, table, on_change, **keywords)
         self._lock, self._controller = threading.Lock(), FocusController(self._values)
         self._started = time.monotonic()
+        self._degauss = DegaussClient(self, self._degauss_ended)
+        self._controller.degauss_offered = lambda: self._degauss.offered
+        WorkerService(self, SetFocus, "set_focus", self._on_set_focus)
+        WorkerService(self, Flatten, "flatten", self._on_flatten)
+        MoveFocusAction(self, self._values)
 
     @abstractmethod
     def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
@@ -79,6 +85,14 @@ class FocusHost(ManagedNode, ABC):
     def refused(self, reason: str) -> None:
         self.deactivate()
 
+    def health(self) -> Health:
+        with self.controller() as (controller, now):
+            return health(controller, self._values, now)
+
+    def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
+        with self.controller() as (controller, now):
+            self.carry_out(controller.degauss_answered(number, now, duration, refusal), now)
+
     def stop(self, order: Order) -> bool:
         """Leave the move of an order where it is; False = another shape was asked for since."""
         with self.controller() as (controller, now):
@@ -101,36 +115,23 @@ class FocusHost(ManagedNode, ABC):
                 return
             time.sleep(POLL_S)
 
-
-class FocusServices:
-    """Serves `set_focus` and `flatten` in worker threads, for the driver's confirmation is waited for.
-
-    Args:
-        node: hosts the services and carries the requests out.
-        driver_timeout: s, now; 0 = never.
-    """
-
-    def __init__(self, node: FocusHost, driver_timeout: Callable[[], float]) -> None:
-        self._node, self._driver_timeout = node, driver_timeout
-        WorkerService(node, SetFocus, "set_focus", self._on_set_focus)
-        WorkerService(node, Flatten, "flatten", self._on_flatten)
-
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
-        return self._answer(request.request, request.dry_run, response)
+        return self._serve(request.request, request.dry_run, response)
 
     def _on_flatten(self, request: Flatten.Request, response: Flatten.Response) -> Flatten.Response:
         flat = FocusRequest(holder=request.holder, take_over=request.take_over)
-        return self._answer(flat, request.dry_run, response)
+        return self._serve(flat, request.dry_run, response)
 
-    def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        self._node.await_start()
-        order = self._node.order(request, dry_run)
-        deadline = time.monotonic() + GRACE_S + (self._driver_timeout() or CONFIRM_S)
+    def _serve(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
+        """Answer in a worker thread, for the driver's confirmation is waited for."""
+        self.await_start()
+        order = self.order(request, dry_run)
+        deadline = time.monotonic() + GRACE_S + (self._values["driver_timeout"] or CONFIRM_S)
         while waits := not (dry_run or order.pending or order.applied or order.refusal):
             if time.monotonic() > deadline:
                 break
             time.sleep(SERVICE_POLL_S)
-        response.state = state = self._node.answer(order)
+        response.state = state = self.answer(order)
         response.error_code, response.message = state.error_code, state.message
         if waits:
             response.error_code = ErrorCode.TIMEOUT
@@ -143,11 +144,11 @@ class MoveFocusAction:
 
     Args:
         node: hosts the action and carries the requests out.
-        settle_time: s, now, for goals that name none.
+        values: its parameters, live.
     """
 
-    def __init__(self, node: FocusHost, settle_time: Callable[[], float]) -> None:
-        self._node, self._settle_time = node, settle_time
+    def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
+        self._node, self._values = node, values
         self._server = WorkerActionServer(
             node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS
         )
@@ -182,7 +183,7 @@ class MoveFocusAction:
         if ended is not None:
             return ended
         handle.publish_feedback(MoveFocus.Feedback(phase="settling", progress=1.0))
-        if not sleep(node.get_clock(), goal.settle_time or self._settle_time(), lambda: self._to_stop(handle)):
+        if not sleep(node.get_clock(), goal.settle_time or self._values["settle_time"], lambda: self._to_stop(handle)):
             return self._stopped(handle, order)
         with node.controller() as (controller, _now):
             keeps = controller.monitor.keeps(order)

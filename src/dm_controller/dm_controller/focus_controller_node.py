@@ -23,16 +23,14 @@ from dm_msgs.msg import (
 )
 from rclpy.clock import Clock, ClockType
 
-from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import qos
 from dm_common.ros.executor import run_node
-from dm_common.ros.lifecycle import Health
 from dm_common.ros.parameters import frame_id
-from dm_controller.focus_actions import DegaussClient, FocusHost, FocusServices, MoveFocusAction
+from dm_controller.focus_actions import FocusHost
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
-from dm_controller.focus_messages import actuator_estimate_message, capabilities_message, health, state_message
+from dm_controller.focus_messages import actuator_estimate_message, capabilities_message, state_message
 from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_types import (
     Effect,
@@ -69,8 +67,7 @@ class FocusControllerNode(FocusHost):
         self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.with_lease(qos.LATCHED))
         self._estimate = self.create_publisher(ActuatorEstimate, "actuator_estimate", qos.LATCHED)
-        self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
-        self._controller.degauss_offered = lambda: self._degauss.offered
+        self._forecast = ForecastClient(self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         warn = partial(self.get_logger().warning, throttle_duration_sec=60.0)
         self._recorder = CreepRecorder(values["state_folder"], self._controller.observer, warn)
@@ -78,8 +75,7 @@ class FocusControllerNode(FocusHost):
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self.create_timer(SLOW_PERIOD_S, self._tick)
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
-        FocusServices(self, lambda: values["driver_timeout"])
-        self._actions = MoveFocusAction(self, lambda: values["settle_time"]), *serve_loops(self, values, LoopHost(self))
+        serve_loops(self, values, LoopHost(self))
         self._driver = qos.watch(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
@@ -149,10 +145,6 @@ class FocusControllerNode(FocusHost):
             self._degauss.retry(controller.conditioning.run)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
-    def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
-        with self.controller() as (controller, now):
-            self.carry_out(controller.degauss_answered(number, now, duration, refusal), now)
-
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
         with self.controller() as (controller, now):
             order, effects = controller.request(message, now, dry_run)
@@ -194,10 +186,6 @@ class FocusControllerNode(FocusHost):
     def _framed(self, message: Any) -> Any:
         message.header.frame_id = self._mirror.header.frame_id if self._mirror is not None else frame_id(self, "")
         return message
-
-    def health(self) -> Health:
-        with self.controller() as (controller, now):
-            return health(controller, self._values, now)
 
 
 def main() -> int:
