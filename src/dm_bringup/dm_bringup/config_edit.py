@@ -13,7 +13,8 @@ Changes = Mapping[str, Mapping[str, Any]]
 def edited(text: str, changes: Changes) -> str:
     """The parameter file `text` with the values of `changes`, {node: {parameter: value}}.
 
-    A value stands where it stood; a new parameter comes first in its section, a new section last in the file.
+    A value stands where it stood; new parameters come first in their section, a new section last in the file, both in
+    the order of `changes`.
 
     Raises:
         ConfigError: the text has a form that cannot be changed so; nothing is lost by an edit.
@@ -21,7 +22,7 @@ def edited(text: str, changes: Changes) -> str:
     expected = values_of(text)
     for node, values in changes.items():
         expected[node] = expected.get(node, {}) | dict(values)
-        for name, value in values.items():
+        for name, value in reversed(list(values.items())):  # each new one goes before those that are there
             text = _with_value(text, node, name, value)
     if values_of(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
