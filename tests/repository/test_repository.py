@@ -113,8 +113,9 @@ def test_package_files_are_valid_and_agree_on_version_and_contact() -> None:
     """As the build farm reads them; `setup.py` takes both from there."""
     package = pytest.importorskip("catkin_pkg.package")
     warnings: list[str] = []
-    known = [package.parse_package(str(path), warnings=warnings) for path in SOURCE.glob("*/package.xml")]
-    assert len(known) == 10 and not warnings
+    files = [*SOURCE.glob("*/package.xml"), ROOT / "examples" / "cpp" / "package.xml"]
+    known = [package.parse_package(str(path), warnings=warnings) for path in files]
+    assert len(known) == 11 and not warnings
     people = {(each.version, who.name, who.email) for each in known for who in (*each.maintainers, *each.authors)}
     assert len(people) == 1 and {tuple(each.licenses) for each in known} == {("Apache-2.0",)}
     for path in SOURCE.glob("*/setup.py"):
