@@ -26,7 +26,7 @@ from dm_calibration.recalibration.update_storage import write_updates
 from dm_calibration.recalibration.updates import SUFFIX, RecalibrationManager, UpdateOptions
 from dm_calibration.report import content, content_hysteresis
 from dm_calibration.report.certificate import certificate, curvatures, keep_people, people
-from dm_calibration.report.checks import next_calibration
+from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
@@ -189,21 +189,23 @@ def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[C
     ]
 
 
-def test_checks_say_what_drifts_and_when_to_calibrate_next(calibration: Calibration, tmp_path: Path) -> None:
+def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibration, tmp_path: Path) -> None:
     held_out = 5e-9 / IN_USE
     known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), held_out, 0.05, 120, ()))
     start = known.created_ns * 1e-9
     # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.
     for growth, days, reason in ((1e-10, 40.0, "the error grows by +3"), (0.0, 24 + 30.0, "no growth")):
-        when, text = next_calibration(checks_of(known, growth), 5e-9, start)
-        assert (when - start) / 86400.0 == pytest.approx(days, abs=3.0) and reason in text
-    assert "too few checks" in next_calibration(checks_of(known, 1e-10, 3), 5e-9, start)[1]
+        until, text = valid_until(checks_of(known, growth), 5e-9, start)
+        assert (until - start) / 86400.0 == pytest.approx(days, abs=3.0) and reason in text
+    assert "too few checks" in valid_until(checks_of(known, 1e-10, 3), 5e-9, start)[1]
     for check in checks_of(known, 1e-10):
         append_check(tmp_path / f"{known.id}.checks.csv", check)
     file = CalibrationStore(tmp_path).save(known)
     page = write_report(known, tmp_path / "out", file).html.read_text()
     section = page[page.index("<h2>Checks since") : page.index("<h2>Summary")]
-    assert "8 maps were compared" in section and "0.10% (4)" in section and "Calibrate next by 2023-12-2" in section
+    assert "8 maps were compared" in section and "0.10% (4)" in section and "Valid until 2023-12-2" in section
+    term = section.partition("Valid until ")[2].partition(".</p>")[0]
+    assert "the error grows by" in term and f"<td>valid until</td><td>{term}</td>" in page  # the certificate's
     assert section.count("<img ") == 1
 
 

@@ -12,7 +12,7 @@ from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
-from dm_calibration.report.checks import next_calibration
+from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
@@ -99,7 +99,7 @@ def certificate(
     reasons = [*calibration.doubts(error_max), *(sentence.rstrip(".") for sentence in since)]
     bound = length(calibration.promise, calibration.wavelength)
     low, high = curvatures(calibration)
-    until, _reason = next_calibration(checks, calibration.promise, calibration.created_ns * 1e-9)
+    until, reason = valid_until(checks, calibration.promise, calibration.created_ns * 1e-9)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
@@ -111,7 +111,7 @@ def certificate(
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
-        ("valid until", f"{utc(round(until * 1e9))}, longer when ./dm check agrees"),
+        ("valid until", f"{utc(round(until * 1e9))}: {reason}"),
         ("operator", names.get("operator") or "not given (./dm report --operator)"),
         ("instrument", names.get("instrument") or "not given (./dm report --instrument)"),
         ("calibration", calibration.id),

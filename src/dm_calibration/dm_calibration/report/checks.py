@@ -1,4 +1,4 @@
-"""Text of the report: what checks have shown since the calibration, what drifts, how fast, when to calibrate next."""
+"""Text of the report: what checks have shown since the calibration, what drifts, how fast, until when it is valid."""
 
 from collections.abc import Sequence
 
@@ -20,8 +20,8 @@ SHOWN = 20
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 
 
-def next_calibration(checks: Sequence[Check], promised: float, created_s: float) -> tuple[float, str]:
-    """When to calibrate next, s since the epoch, and why.
+def valid_until(checks: Sequence[Check], promised: float, created_s: float) -> tuple[float, str]:
+    """Until when a calibration is valid, s since the epoch, and why; the next is to be made by then.
 
     The trend is the median of all slopes between two checks; it counts where its 90 % interval is above zero.
 
@@ -51,7 +51,7 @@ def checks_section(calibration: Calibration, checks: Sequence[Check]) -> Section
     """
     last, created, promised = checks[-1], calibration.created_ns * 1e-9, calibration.promise
     days = max(last.time - created, 1.0) / DAY_S
-    when, reason = next_calibration(checks, promised, created)
+    until, reason = valid_until(checks, promised, created)
     outside = sum(check.max_zernike > promised for check in checks)
     sentences = [
         f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "
@@ -59,7 +59,7 @@ def checks_section(calibration: Calibration, checks: Sequence[Check]) -> Section
         f"{length(promised, calibration.wavelength)}: one in twenty may.",
         f"In {days:.1f} days gains have changed by up to {last.gain_drift:.2%} (actuator {last.actuator}), the figure "
         f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows.",
-        f"Calibrate next by {utc(round(when * 1e9))}: {reason}.",
+        f"Valid until {utc(round(until * 1e9))}: {reason}.",
     ]
     rows = [
         (
