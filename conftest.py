@@ -80,7 +80,6 @@ TEST_BY_TEST = frozenset(
         "test_autofocus_node",
         "test_calibration_faults",
         "test_calibration_node",
-        "test_converge_action",
         "test_driver_node",
         "test_electronics_contract",
         "test_faults_calibration",
@@ -92,9 +91,9 @@ TEST_BY_TEST = frozenset(
         "test_faults_soak",
         "test_focus_controller_node",
         "test_interferometer_node",
+        "test_loop_actions",
         "test_many_mirrors",
         "test_recalibration_node",
-        "test_recipe_action",
         "test_virtual_bench_node",
         "test_whole_runs",
     }

@@ -37,118 +37,116 @@ PATIENCE_S = 60.0
 DISCOVERY_S = 1.0
 
 
-@pytest.fixture
-def bench(observer: Observer) -> StandIn:
-    mirror = make_mirror(1)
-    return StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9, piston_tilt=1e-7))
+class Rig:
+    """The node, driver and interferometer around it as stand-ins, and where it keeps its calibrations.
 
+    Args:
+        start: starts a node as a process.
+        observer: hosts the stand-ins, and asks.
+        folder: of the calibrations.
+    """
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return tmp_path / "calibrations"
+    def __init__(self, start: Callable[..., NodeProcess], observer: Observer, folder: Path) -> None:
+        mirror = make_mirror(1)
+        self.bench = StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9, piston_tilt=1e-7))
+        self.observer, self.folder, self._start = observer, folder, start
+        self._received = observer.record(CalibrationMsg, "calibration", qos.LATCHED)
 
+    def parameters(self, **changes: Any) -> dict[str, Any]:
+        return {
+            "calibration_folder": str(self.folder),
+            "settle_time": 0.01,
+            "driver_timeout": 5.0,
+            "write_report": False,
+            **changes,
+        }
 
-@pytest.fixture
-def node(
-    start: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> Callable[..., NodeProcess]:
-    """node(parameter=value, ...) starts the node and waits for it: one that was killed still seems to be there."""
-    received = observer.record(CalibrationMsg, "calibration", qos.LATCHED)
-
-    def begin(**changes: Any) -> NodeProcess:
-        before = len(received)
-        process = start("dm_calibration", "calibration", parameters(folder, **changes))
-        wait_until(lambda: len(received) > before, PATIENCE_S, process.output)
+    def start(self, **changes: Any) -> NodeProcess:
+        """Start the node and wait for it: one that was killed still seems to be there."""
+        before = len(self._received)
+        process = self._start("dm_calibration", "calibration", self.parameters(**changes))
+        wait_until(lambda: len(self._received) > before, PATIENCE_S, process.output)
         time.sleep(DISCOVERY_S)
         return process
 
-    return begin
+    def send(
+        self, goal: Calibrate.Goal | None = None, feedback: Callable[[Any], None] | None = None
+    ) -> tuple[Any, Any]:
+        return self.observer.send_goal(Calibrate, "calibrate", goal or pokes(), feedback)
+
+    def run(self, goal: Calibrate.Goal | None = None) -> Calibrate.Result:
+        return self.observer.run_goal(Calibrate, "calibrate", goal or pokes(), PATIENCE_S).result
+
+    def run_with(self, fault: Callable[[], object]) -> Calibrate.Result:
+        """A run during which something happens as the map poke+03 is asked for; then it does no more."""
+        self.bench.on_label = {"poke+03": fault}
+        result = self.run()
+        self.bench.on_label = {}
+        return result
+
+    def run_killed_at(self, label: str, goal: Calibrate.Goal | None = None) -> Calibrate.Result:
+        """A run whose node is killed at a step, is started again, and gets the goal once more."""
+        process = self.start()
+        if label == "degauss":
+            self.bench.on_degauss_done = process.process.kill
+        else:
+            self.bench.on_label = {label: process.process.kill}
+        self.send(goal)
+        wait_until(lambda: not process.running, PATIENCE_S, process.output)
+        self.bench.on_label, self.bench.on_degauss_done = {}, None
+        self.start()
+        return self.run(goal)
+
+    def unfinished(self) -> list[Path]:
+        """Journals of runs that would go on."""
+        return [
+            path for path in (self.folder / "unfinished").iterdir() if path.is_dir() and path.suffix != ".set-aside"
+        ]
+
+    def assert_each_once(self, result: Calibrate.Result, repeated: int = 0) -> None:
+        """The stored calibration holds each state once; each map was asked for once, but `repeated` once more."""
+        assert result.error_code == ErrorCode.OK, result.message
+        stored = CalibrationStore(self.folder).load(result.id)
+        labels = [label for label in stored.maps.label if "resumed" not in label]
+        assert len(labels) == STATES and len(self.bench.measured) == len(stored.maps) + repeated
+        assert not self.unfinished()
+        assert (self.bench.signals == 0.0).all()
 
 
-def parameters(folder: Path, **changes: Any) -> dict[str, Any]:
-    return {
-        "calibration_folder": str(folder),
-        "settle_time": 0.01,
-        "driver_timeout": 5.0,
-        "write_report": False,
-        **{name.replace("__", "."): value for name, value in changes.items()},
-    }
+@pytest.fixture
+def rig(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) -> Rig:
+    return Rig(start, observer, tmp_path / "calibrations")
 
 
 def pokes(**fields: Any) -> Calibrate.Goal:
     return Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True, **fields)
 
 
-def run(observer: Observer, goal: Calibrate.Goal | None = None) -> Calibrate.Result:
-    return observer.run_goal(Calibrate, "calibrate", goal or pokes(), PATIENCE_S).result
-
-
-def unfinished(folder: Path) -> list[Path]:
-    """Journals of runs that would go on."""
-    return [path for path in (folder / "unfinished").iterdir() if path.is_dir() and path.suffix != ".set-aside"]
-
-
-def assert_each_once(result: Calibrate.Result, bench: StandIn, folder: Path, repeated: int = 0) -> None:
-    """The stored calibration holds each state once; the interferometer was asked once for each map but `repeated`."""
-    assert result.error_code == ErrorCode.OK, result.message
-    stored = CalibrationStore(folder).load(result.id)
-    labels = [label for label in stored.maps.label if "resumed" not in label]
-    assert len(labels) == STATES and len(bench.measured) == len(stored.maps) + repeated
-    assert not unfinished(folder)
-    assert (bench.signals == 0.0).all()
-
-
 @pytest.mark.parametrize("label", ["degauss", "reference 1", "poke+01", "poke-05", "reference 2", "reference 3"])
-def test_killed_at_any_step_the_run_goes_on(
-    label: str, node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    process = node()
-    if label == "degauss":
-        bench.on_degauss_done = lambda: process.process.kill()
-    else:
-        bench.on_label = {label: lambda: process.process.kill()}
-    observer.send_goal(Calibrate, "calibrate", pokes())
-    wait_until(lambda: not process.running, PATIENCE_S, process.output)
-    bench.on_label, bench.on_degauss_done = {}, None
-    taken = len(bench.measured)
-    node()
-    result = run(observer)
+def test_killed_at_any_step_the_run_goes_on(label: str, rig: Rig) -> None:
+    result = rig.run_killed_at(label)
+    taken = 0 if label == "degauss" else rig.bench.measured.index(label) + 1
     # The map during which the node was killed never arrived: it is measured for the first time now.
-    assert_each_once(result, bench, folder, repeated=1 if taken else 0)
+    rig.assert_each_once(result, repeated=1 if taken else 0)
     assert ("resumed run" in result.message) == (taken > 1)
-    assert bench.degaussed == 2
+    assert rig.bench.degaussed == 2
 
 
 @pytest.mark.parametrize("label", ["p03", "p57"])
-def test_killed_at_a_surface_a_full_run_goes_on(
-    label: str, node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    process = node()
-    bench.on_label = {label: lambda: process.process.kill()}
-    full = Calibrate.Goal(plan=Calibrate.Goal.PLAN_FULL)
-    observer.send_goal(Calibrate, "calibrate", full)
-    wait_until(lambda: not process.running, PATIENCE_S, process.output)
-    bench.on_label = {}
-    node()
-    result = run(observer, full)
+def test_killed_at_a_surface_a_full_run_goes_on(label: str, rig: Rig) -> None:
+    result = rig.run_killed_at(label, Calibrate.Goal(plan=Calibrate.Goal.PLAN_FULL))
     assert result.error_code == ErrorCode.OK and "resumed run" in result.message, result.message
-    stored = CalibrationStore(folder).load(result.id)
-    assert not result.dropped and len(bench.measured) == len(stored.maps) + 1
+    stored = CalibrationStore(rig.folder).load(result.id)
+    assert not result.dropped and len(rig.bench.measured) == len(stored.maps) + 1
     assert len(stored.targets) == len(set(stored.targets)) == 15
 
 
 @pytest.mark.parametrize("place", ["frame", "fit", "before_store", "after_store", "read_back"])
 def test_killed_in_the_middle_of_writing_nothing_is_lost_or_measured_twice(
-    place: str,
-    node: Callable[..., NodeProcess],
-    bench: StandIn,
-    observer: Observer,
-    folder: Path,
-    tmp_path: Path,
-    domain: int,
+    place: str, rig: Rig, tmp_path: Path, domain: int
 ) -> None:
     settings = tmp_path / "stuck.yaml"
-    settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters(folder)}}))
+    settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": rig.parameters()}}))
     script = Path(__file__).parents[1] / "stuck_calibration.py"
     log = (tmp_path / "stuck.log").open("wb")
     process = subprocess.Popen(
@@ -158,58 +156,54 @@ def test_killed_in_the_middle_of_writing_nothing_is_lost_or_measured_twice(
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
     )
     try:
-        observer.send_goal(Calibrate, "calibrate", pokes())
+        rig.send()
         wait_until(lambda: MARK in (tmp_path / "stuck.log").read_text(), PATIENCE_S, place)
     finally:
         process.kill()
         process.wait()
         log.close()
-    (kept,) = unfinished(folder)
+    (kept,) = rig.unfinished()
     journal = read_run(kept)
     hashes = [record_hash(record) for record in journal.outcome.records]
-    before = len(bench.measured)
+    before = len(rig.bench.measured)
     assert len(hashes) == before - (1 if place == "frame" else 0)
-    node()
-    result = run(observer)
-    assert_each_once(result, bench, folder, repeated=1 if place == "frame" else 0)
+    rig.start()
+    result = rig.run()
+    rig.assert_each_once(result, repeated=1 if place == "frame" else 0)
     if place != "frame":
-        assert len(bench.measured) == before
-    assert map_hashes(CalibrationStore(folder).load(result.id).maps)[: len(hashes)] == hashes
-    assert len(list(folder.glob("*.h5"))) == 1 and not list(folder.glob(".*.tmp"))
+        assert len(rig.bench.measured) == before
+    assert map_hashes(CalibrationStore(rig.folder).load(result.id).maps)[: len(hashes)] == hashes
+    assert len(list(rig.folder.glob("*.h5"))) == 1 and not list(rig.folder.glob(".*.tmp"))
 
 
-def test_cancelled_and_started_again_it_goes_on(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    node()
-    handle, future = observer.send_goal(Calibrate, "calibrate", pokes())
-    wait_until(lambda: len(bench.measured) >= 4, PATIENCE_S)
+def test_cancelled_and_started_again_it_goes_on(rig: Rig) -> None:
+    rig.start()
+    handle, future = rig.send()
+    wait_until(lambda: len(rig.bench.measured) >= 4, PATIENCE_S)
     handle.cancel_goal_async()
     wait_until(future.done, PATIENCE_S)
     cancelled = future.result()
     assert cancelled.status == GoalStatus.STATUS_CANCELED
     assert "maps are kept in" in cancelled.result.message and "the mirror is back" in cancelled.result.message
     seen: list[Any] = []
-    _, again = observer.send_goal(Calibrate, "calibrate", pokes(), lambda m: seen.append(m.feedback.label))
+    _, again = rig.send(feedback=lambda message: seen.append(message.feedback.label))
     wait_until(again.done, PATIENCE_S)
-    assert_each_once(again.result().result, bench, folder)
+    rig.assert_each_once(again.result().result)
     assert any(label.startswith("degauss (resumed after") for label in seen)
 
 
-def test_start_fresh_is_for_one_goal(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    bench.failing = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(3, 8)}
-    process = node(start_fresh=True)
-    assert "3 states in a row" in run(observer).message
-    second = run(observer)
-    assert "resumed run" in second.message and len(unfinished(folder)) == 1
-    bench.failing = set()
+def test_start_fresh_is_for_one_goal(rig: Rig) -> None:
+    rig.bench.failing = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(3, 8)}
+    process = rig.start(start_fresh=True)
+    assert "3 states in a row" in rig.run().message
+    second = rig.run()
+    assert "resumed run" in second.message and len(rig.unfinished()) == 1
+    rig.bench.failing = set()
     process.stop()
-    node(start_fresh=True)
-    fresh = run(observer)
+    rig.start(start_fresh=True)
+    fresh = rig.run()
     assert fresh.error_code == ErrorCode.OK and "resumed" not in fresh.message
-    assert len(list((folder / "unfinished").glob("*.set-aside"))) == 1
+    assert len(list((rig.folder / "unfinished").glob("*.set-aside"))) == 1
 
 
 @pytest.mark.parametrize(
@@ -223,22 +217,16 @@ def test_start_fresh_is_for_one_goal(
     ],
 )
 def test_maps_of_another_instrument_stop_the_run_which_goes_on_with_the_right_one(
-    change: dict[str, Any],
-    words: str,
-    node: Callable[..., NodeProcess],
-    bench: StandIn,
-    observer: Observer,
-    folder: Path,
+    change: dict[str, Any], words: str, rig: Rig
 ) -> None:
-    node()
-    bench.on_label = {"poke+03": lambda: bench.other.update(change)}
-    stopped = run(observer)
+    rig.start()
+    stopped = rig.run_with(lambda: rig.bench.other.update(change))
     assert stopped.error_code == ErrorCode.MAP_REJECTED and words in stopped.message, stopped.message
-    assert (bench.signals == 0.0).all() and len(unfinished(folder)) == 1
-    refused = len(bench.measured)
-    bench.other, bench.on_label = {}, {}
-    result = run(observer)
-    assert_each_once(result, bench, folder, repeated=refused - bench.measured.index("poke+03"))
+    assert (rig.bench.signals == 0.0).all() and len(rig.unfinished()) == 1
+    refused = len(rig.bench.measured)
+    rig.bench.other = {}
+    result = rig.run()
+    rig.assert_each_once(result, repeated=refused - rig.bench.measured.index("poke+03"))
     assert not result.dropped
 
 
@@ -250,119 +238,94 @@ def test_maps_of_another_instrument_stop_the_run_which_goes_on_with_the_right_on
         ({"figure": 2e-6}, "the figure changed by"),
     ],
 )
-def test_a_bumped_mirror_is_found_by_the_reference_frame(
-    bump: dict[str, float],
-    words: str,
-    node: Callable[..., NodeProcess],
-    bench: StandIn,
-    observer: Observer,
-    folder: Path,
-) -> None:
-    node()
-    bench.on_label = {"poke+03": lambda: bench.bump.update(bump)}
-    stopped = run(observer)
+def test_a_bumped_mirror_is_found_by_the_reference_frame(bump: dict[str, float], words: str, rig: Rig) -> None:
+    rig.start()
+    stopped = rig.run_with(lambda: rig.bench.bump.update(bump))
     assert stopped.error_code == ErrorCode.MAP_REJECTED
     assert words in stopped.message and "bumped" in stopped.message, stopped.message
     assert sum("in doubt, bumped before reference 2" in entry for entry in stopped.dropped) == 10
     if "shift_px" in bump:  # left as it stands, it is told again; a tilt may have been aligned anew
-        assert "does not stand as it did before" in run(observer).message
-    bench.on_label = {}
-    bench.bump.clear()
-    result = run(observer)
+        assert "does not stand as it did before" in rig.run().message
+    rig.bench.bump.clear()
+    result = rig.run()
     assert result.error_code == ErrorCode.OK, result.message
-    stored = CalibrationStore(folder).load(result.id)
+    stored = CalibrationStore(rig.folder).load(result.id)
     assert len({label for label in stored.maps.label if "resumed" not in label}) == STATES
     # Only what was measured again is in the result.
     resumed = min(k for k, label in enumerate(stored.maps.label) if "resumed" in label)
     assert resumed == 1 and stored.maps.label[0] == "reference 1"
 
 
-def test_another_mirror_in_the_middle_stops_the_run(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    node()
-    bench.on_label = {"poke+03": lambda: bench.publish_info(make_mirror(1, serial="T-2"))}
-    stopped = run(observer)
+def test_another_mirror_in_the_middle_stops_the_run(rig: Rig) -> None:
+    rig.start()
+    stopped = rig.run_with(lambda: rig.bench.publish_info(make_mirror(1, serial="T-2")))
     assert stopped.error_code == ErrorCode.CALIBRATION_MISMATCH and "'T-2', before it was" in stopped.message
-    other = run(observer)  # with the other mirror: a run of its own
+    other = rig.run()  # with the other mirror: a run of its own
     assert other.error_code == ErrorCode.OK and "resumed" not in other.message
-    assert len(unfinished(folder)) == 1
+    assert len(rig.unfinished()) == 1
 
 
-def test_a_driver_that_was_restarted_stops_the_run(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
+def test_a_driver_that_was_restarted_stops_the_run(rig: Rig) -> None:
     def restarted() -> None:
-        bench.history_known = False
-        bench.publish_state()
+        rig.bench.history_known = False
+        rig.bench.publish_state()
 
-    node()
-    bench.on_label = {"poke+03": restarted}
-    stopped = run(observer)
-    assert "no longer knows what the actuators went through" in stopped.message
-    bench.on_label = {}
-    assert run(observer).error_code == ErrorCode.OK
+    rig.start()
+    assert "no longer knows what the actuators went through" in rig.run_with(restarted).message
+    assert rig.run().error_code == ErrorCode.OK
 
 
-def test_a_full_disk_stops_the_run_and_keeps_what_was_measured(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    process = node()
+def test_a_full_disk_stops_the_run_and_keeps_what_was_measured(rig: Rig) -> None:
+    process = rig.start()
 
-    def full() -> None:
-        resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (10000, resource.RLIM_INFINITY))
+    def allow(size: int) -> None:
+        resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
-    bench.on_label = {"poke+03": full}
-    stopped = run(observer)
+    stopped = rig.run_with(lambda: allow(10000))
     assert stopped.error_code == ErrorCode.STORAGE_FAILED and "could not be kept" in stopped.message
-    assert (bench.signals == 0.0).all()
-    bench.on_label = {}
-    before = len(bench.measured)
-    refused = run(observer)
+    assert (rig.bench.signals == 0.0).all()
+    before = len(rig.bench.measured)
+    refused = rig.run()
     assert refused.error_code == ErrorCode.STORAGE_FAILED and "no room for the maps" in refused.message
-    assert len(bench.measured) == before  # told before anything moved
-    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    assert_each_once(run(observer), bench, folder, repeated=1)
+    assert len(rig.bench.measured) == before  # told before anything moved
+    allow(resource.RLIM_INFINITY)
+    rig.assert_each_once(rig.run(), repeated=1)
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_anything_moves(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    folder.write_text("a file where the folder should be")  # read-only folders do not stop root
-    node()
-    refused = run(observer)
+def test_a_folder_that_cannot_be_written_is_told_before_anything_moves(rig: Rig) -> None:
+    rig.folder.write_text("a file where the folder should be")  # read-only folders do not stop root
+    rig.start()
+    refused = rig.run()
     assert refused.error_code == ErrorCode.STORAGE_FAILED and "no run can be kept" in refused.message
-    assert not bench.measured and not bench.degaussed
+    assert not rig.bench.measured and not rig.bench.degaussed
 
 
-def test_of_two_goals_one_calibrates(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
-    process = node()
-    _, first = observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.5))
-    wait_until(lambda: len(bench.measured) >= 2, PATIENCE_S)
-    second = run(observer, pokes(settle_time=0.5))
+def test_of_two_goals_one_calibrates(rig: Rig) -> None:
+    process = rig.start()
+    _, first = rig.send(pokes(settle_time=0.5))
+    wait_until(lambda: len(rig.bench.measured) >= 2, PATIENCE_S)
+    second = rig.run(pokes(settle_time=0.5))
     assert second.error_code == ErrorCode.BUSY and "goal refused: action calibrate has been running" in process.output
     wait_until(first.done, PATIENCE_S)
-    assert_each_once(first.result().result, bench, folder)
+    rig.assert_each_once(first.result().result)
 
 
-def test_old_and_truncated_files_are_refused_by_name(
-    node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
-) -> None:
+def test_old_and_truncated_files_are_refused_by_name(rig: Rig) -> None:
     import h5py
 
-    node()
-    result = run(observer)
+    def loaded() -> LoadCalibration.Response:
+        return rig.observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=result.id))
+
+    rig.start()
+    result = rig.run()
     whole = Path(result.file).read_bytes()
     Path(result.file).write_bytes(whole[: len(whole) // 2])
-    refused = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=result.id))
+    refused = loaded()
     assert refused.error_code == ErrorCode.CALIBRATION_UNREADABLE and "not a whole HDF5 file" in refused.message
     Path(result.file).write_bytes(whole)
     with h5py.File(result.file, "r+") as file:
         file.attrs["schema_version"] = 0
-    refused = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=result.id))
-    assert refused.error_code == ErrorCode.CALIBRATION_UNREADABLE
-    listed = observer.call(ListCalibrations, "list_calibrations")
+    assert loaded().error_code == ErrorCode.CALIBRATION_UNREADABLE
+    listed = rig.observer.call(ListCalibrations, "list_calibrations")
     assert listed.remarks[0]
     assert np.isfinite(result.in_sample_rms)
