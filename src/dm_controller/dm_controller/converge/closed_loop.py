@@ -27,7 +27,7 @@ from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.measurement import Bench
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-from dm_controller.planning.mirror_model import InfluenceModel, response, target_shape
+from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
 
@@ -58,25 +58,36 @@ class LoopOptions:
     correct_last: bool = False
 
 
-@dataclass(frozen=True, eq=False)
 class Creep:
-    """What a loop needs to foresee creep.
+    """Foresees creep from the map just taken to the next, which will take as long as this one did.
 
-    Attributes:
+    Args:
         law: of the actuators; one that does not creep foresees nothing.
-        state: before the loop's first command.
+        state: before the loop's first command, which goes out next.
         now: the plant's time, s, in steady advance, of the clock of `state`.
     """
 
-    law: HysteresisModel
-    state: HysteresisState
-    now: Callable[[], float]
+    def __init__(self, law: HysteresisModel, state: HysteresisState, now: Callable[[], float]) -> None:
+        self._law, self._state, self._now = law, state, now
+        self._last = now()
 
     @classmethod
     def of_rate(cls, rate: float, signals: Floats, now: Callable[[], float]) -> Creep:
         """Of actuators without hysteresis that creep by `rate` per decade and have long stood at `signals` (N,)."""
         law = HysteresisModel.linear(rate)
         return cls(law, rested(law, signals, now()), now)
+
+    def moved(self, signals: Floats) -> None:
+        """The plant went to `signals` (N,) just now."""
+        self._state = self._law.move(self._state, signals, self._now())
+
+    def foreseen(self) -> Floats:
+        """(N,) change of the effective signals until the next map."""
+        law, now = self._law, self._now()
+        self._state = law.advance(self._state, now)
+        then = law.advance(self._state, 2.0 * now - self._last)
+        self._last = now
+        return law.effective(then) - law.effective(self._state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,26 +144,6 @@ class StoppedLoop(Cancelled):
         self.steps = steps
 
 
-class _Foresight:
-    """Drift from the map just taken to the next, which will take as long as this one did."""
-
-    def __init__(self, creep: Creep, model: InfluenceModel) -> None:
-        self._creep, self._model, self._state = creep, model, creep.state
-        self._last = creep.now()
-
-    def moved(self, signals: Floats) -> None:
-        """The plant went to `signals` (N,) just now."""
-        self._state = self._creep.law.move(self._state, signals, self._creep.now())
-
-    def drift(self) -> Shape:
-        """Change of the surface until the next map."""
-        law, now = self._creep.law, self._creep.now()
-        self._state = law.advance(self._state, now)
-        then = law.advance(self._state, 2.0 * now - self._last)
-        self._last = now
-        return response(self._model, law.effective(then) - law.effective(self._state))
-
-
 def response_ratio(asked: Shape, seen: Shape) -> float:
     """Share of a change that was seen, by least squares over the coefficients beyond tilt; NaN when too little moved.
 
@@ -193,7 +184,6 @@ def converge(
     wanted = target_shape(target, model)
     command = solver.solve(wanted)
     signals, overflow = (command.signals, command.overflow) if start is None else (start, 0.0)
-    foresight = _Foresight(creep, model) if creep is not None and creep.law.creep_rate else None
     steps: list[LoopStep] = []
     damping, scale = 1.0, 1.0
     drift = response(model, np.zeros_like(signals))
@@ -201,8 +191,8 @@ def converge(
         if cancelled():
             raise StoppedLoop(tuple(steps))
         applied = plant.apply(signals)
-        if foresight is not None:
-            foresight.moved(applied)
+        if creep is not None:
+            creep.moved(applied)
         if not plant.settle():
             raise StoppedLoop(tuple(steps))
         number = len(steps) + 1
@@ -227,8 +217,8 @@ def converge(
             break
         if converged or (used_up and not options.correct_last):
             break
-        if foresight is not None:
-            drift = foresight.drift()
+        if creep is not None:
+            drift = response(model, creep.foreseen())
         better = solver.correct(signals, error + drift)
         # Beyond the full step only as far as the limits go.
         moved = solver.limited(signals + scale * damping * (better.signals - signals))
