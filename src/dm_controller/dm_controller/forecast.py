@@ -95,19 +95,18 @@ class ForecastClient:
             active: the calibration in use; None = none.
             tolerance: m, largest coefficient error at which a curvature counts as reachable.
         """
-        wanted = active if active is not None and active.planner.hysteresis is None else None
-        calibration_id = wanted.calibration.id if wanted is not None else ""
+        if active is not None and active.planner.hysteresis is not None:
+            active = None
+        calibration_id = active.calibration.id if active is not None else ""
         if calibration_id != self._calibration_id:
             self._calibration_id, self._refused, self.share = calibration_id, False, None
             self._asked_at = -float("inf")
-        if self.share is not None or self._refused or time.monotonic() < self._asked_at + RETRY_S:
+        if active is None or self.share is not None or self._refused or not self._client.service_is_ready():
             return
-        if wanted is None:
+        if time.monotonic() < self._asked_at + RETRY_S:
             return
-        mirror, curvatures = wanted.mirror, wanted.reachable_range(FocusTarget(0.0), tolerance)
+        mirror, curvatures = active.mirror, active.reachable_range(FocusTarget(0.0), tolerance)
         if not np.isfinite(curvatures).all():
-            return
-        if not self._client.service_is_ready():
             return
         self._asked_at = time.monotonic()
         for future in self._pending:
