@@ -7,27 +7,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import BuildRecipes, Converge
-from dm_msgs.msg import Calibration, ErrorCode, FocusRequest
+from dm_msgs.msg import ErrorCode, FocusRequest
 from dm_msgs.srv import StoreRecipes
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calibration_stand_in import StandIn
 from dm_common.errors import Refusal
-from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import recipe_book_from
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
-from dm_controller.focus_parameters import LOOP_PARAMETERS, REACHABLE_TOLERANCE
-from dm_controller.loop_actions import LoopHost, serve_loops
-from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
+from dm_controller.focus_controller import FocusController
+from dm_controller.focus_parameters import PARAMETERS
+from dm_controller.focus_types import Moment, Order
+from dm_controller.loop_actions import serve_loops
 from dm_controller.planning.target import FocusTarget
 from focus_bench import calibration, mirror_info
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -38,26 +39,21 @@ GAIN = 0.85
 ACTIONS = {Converge.Goal: (Converge, "converge"), BuildRecipes.Goal: (BuildRecipes, "build_recipes")}
 
 
-class Host(Node, LoopHost):
-    """What the focus controller does to host the actions."""
+class Host(Node):
+    """What hosts the actions: the focus controller, which no driver reports to."""
 
     def __init__(self) -> None:
-        Node.__init__(self, "loop_host")
-        self.refuse = False
-        self.calibration: Calibration | None = calibration(held_out_rms=1e-10, held_out_max_zernike=1e-10)
-        self.values = declare(self, (*LOOP_PARAMETERS, REACHABLE_TOLERANCE))
-        serve_loops(self, self.values, self)
+        super().__init__("loop_host")
+        values = declare(self, PARAMETERS)
+        self.focus, self.now = FocusController(values), Moment(0, 0.0, 0.0)
+        self.focus.use(calibration(held_out_rms=1e-10, held_out_max_zernike=1e-10), mirror_info())
+        serve_loops(cast(Any, self), values)
 
-    def target(self, wanted: FocusRequest) -> FocusTarget:
-        if self.refuse:
-            raise Refusal(ErrorCode.STALE, "header.stamp: the request is 9 s old")
-        return FocusTarget(wanted.curvature, wanted.conic_constant, tuple(wanted.zernike))
+    def order(self, wanted: FocusRequest, dry_run: bool) -> Order:
+        return self.focus.request(wanted, self.now, dry_run)[0]
 
-    def active_calibration(self) -> ActiveCalibration:
-        return active_calibration(self.calibration, mirror_info())
-
-    def hysteresis(self) -> HysteresisState | None:
-        return None
+    def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
+        return nullcontext((self.focus, self.now))
 
 
 class Rig:
@@ -186,16 +182,17 @@ def test_cancelling_leaves_the_last_command(rig: Rig) -> None:
 
 
 def test_what_the_host_refuses_does_not_start(rig: Rig) -> None:
-    rig.host.refuse = True
+    rig.host.focus.rest(Refusal(ErrorCode.STALE, "header.stamp: the request is 9 s old"), rig.host.now)
     _, result = rig.run(converge())
     assert (result.error_code, result.message) == (ErrorCode.STALE, "header.stamp: the request is 9 s old")
-    rig.host.refuse, rig.host.calibration = False, None
+    rig.host.focus.use(None, mirror_info())
     assert rig.run(converge())[1].error_code == ErrorCode.NOT_CALIBRATED
     assert not rig.bench.measured
 
 
 def test_what_is_reachable_is_what_requests_go_by(rig: Rig) -> None:
-    edge = rig.host.active_calibration().planner.mirror.reachable_range(FocusTarget(0.0), 2e-8)[1]
+    assert rig.host.focus.active is not None
+    edge = rig.host.focus.active.reachable_range(FocusTarget(0.0), 2e-8)[1]
     assert rig.run(recipes(1.02 * edge))[1].error_code == ErrorCode.UNREACHABLE
     rig.host.set_parameters([Parameter("reachable_tolerance", value=1e-5)])
     assert rig.run(recipes(1.02 * edge))[1].recipes == 1

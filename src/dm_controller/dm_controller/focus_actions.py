@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from copy import copy
 from typing import Any
@@ -18,14 +18,13 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import Health, ManagedNode
-from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_common.values import without_figures
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import health
-from dm_controller.focus_parameters import MOVE_FOCUS
+from dm_controller.focus_parameters import MOVE_FOCUS, PARAMETERS
 from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
 
 #: How often an order is looked after, s: by an action, by a service, and how often feedback is published.
@@ -40,17 +39,11 @@ class FocusHost(ManagedNode, ABC):
     """The services, actions and lifecycle of the node: one thread at a time has the controller.
 
     Args:
-        name, table, on_change, keywords: see `ManagedNode`.
+        on_change, keywords: see `ManagedNode`.
     """
 
-    def __init__(
-        self,
-        name: str,
-        table: Sequence[Parameter],
-        on_change: Callable[[Mapping[str, Any]], None],
-        **keywords: Any,
-    ) -> None:
-        super().__init__(name, table, on_change, **keywords)
+    def __init__(self, on_change: Callable[[Mapping[str, Any]], None], **keywords: Any) -> None:
+        super().__init__("focus_controller", PARAMETERS, on_change, **keywords)
         self._lock, self._controller = threading.Lock(), FocusController(self._values)
         self._started = time.monotonic()
         self._degauss = DegaussClient(self, self._degauss_ended)

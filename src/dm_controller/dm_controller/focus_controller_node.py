@@ -31,7 +31,6 @@ from dm_common.ros.parameters import frame_id
 from dm_controller.focus_actions import FocusHost
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import actuator_estimate_message, capabilities_message, state_message
-from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_types import (
     Effect,
     Moment,
@@ -43,7 +42,7 @@ from dm_controller.focus_types import (
     StartDegauss,
 )
 from dm_controller.forecast import ForecastClient
-from dm_controller.loop_actions import LoopHost, serve_loops
+from dm_controller.loop_actions import serve_loops
 
 #: How often silence of the driver is noticed, s of wall time.
 STEADY_PERIOD_S = 0.5
@@ -58,7 +57,7 @@ class FocusControllerNode(FocusHost):
     """
 
     def __init__(self, **keywords: Any) -> None:
-        super().__init__("focus_controller", PARAMETERS, self._on_parameters, **keywords)
+        super().__init__(self._on_parameters, **keywords)
         values = self._values
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
@@ -75,7 +74,7 @@ class FocusControllerNode(FocusHost):
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self.create_timer(SLOW_PERIOD_S, self._tick)
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
-        serve_loops(self, values, LoopHost(self))
+        serve_loops(self, values)
         self._driver = qos.watch(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)

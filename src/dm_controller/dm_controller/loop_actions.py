@@ -10,7 +10,6 @@ import numpy as np
 from dm_msgs.action import BuildRecipes, Converge
 from dm_msgs.msg import Calibration, FocusRequest
 from dm_msgs.srv import StoreRecipes
-from rclpy.node import Node
 
 from dm_common import Floats
 from dm_common.errors import EXPECTED, ErrorCode, MeasurementError, error_code
@@ -35,33 +34,6 @@ BUSY = {
 OUTCOMES: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}
 
 
-class LoopHost:
-    """What closed loops ask of the focus controller, from any thread."""
-
-    def __init__(self, node: FocusHost) -> None:
-        self._node = node
-
-    def target(self, request: FocusRequest) -> FocusTarget:
-        """The target of a request that could be carried out. Raises Refusal, as for a move."""
-        order = self._node.order(request, dry_run=True)
-        if order.refusal is not None:
-            raise order.refusal
-        assert order.move is not None  # else it is refused
-        return order.move.target
-
-    def active_calibration(self) -> ActiveCalibration:
-        """The calibration in use. Raises Refusal."""
-        with self._node.controller() as (controller, _now):
-            if controller.active is None:
-                raise controller.not_calibrated
-            return controller.active
-
-    def hysteresis(self) -> HysteresisState | None:
-        """What is known of the actuators; None = nothing."""
-        with self._node.controller() as (controller, now):
-            return controller.observer.estimate(now.time).state
-
-
 def loop_times(values: Mapping[str, Any]) -> Mapping[str, Any]:
     """What `BenchServices` goes by, from the parameters of the node; these may change while it rests."""
     own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
@@ -69,7 +41,7 @@ def loop_times(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 class LoopBench(BenchServices):
-    """Driver and interferometer, for one goal of either action at a time.
+    """Driver and interferometer, for one goal of either action at a time; and what the focus controller knows.
 
     Args:
         node: the hosting node.
@@ -77,12 +49,11 @@ class LoopBench(BenchServices):
 
     Attributes:
         parameters: as given.
-        host: what the node knows and can do.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
+    def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
         super().__init__(node, loop_times(values))
-        self.host, self.parameters = host, values
+        self._host, self.parameters = node, values
         self._goal = threading.Lock()
         self._needed: qos.Liveliness | None = None
 
@@ -128,6 +99,26 @@ class LoopBench(BenchServices):
             self._node.get_logger().warning(f"{name}: {text}")
         return OUTCOMES.get(code, "abort"), code, text
 
+    def target(self, request: FocusRequest) -> FocusTarget:
+        """The target of a request that could be carried out. Raises Refusal, as for a move."""
+        order = self._host.order(request, dry_run=True)
+        if order.refusal is not None:
+            raise order.refusal
+        assert order.move is not None  # else it is refused
+        return order.move.target
+
+    def active_calibration(self) -> ActiveCalibration:
+        """The calibration in use. Raises Refusal."""
+        with self._host.controller() as (controller, _now):
+            if controller.active is None:
+                raise controller.not_calibrated
+            return controller.active
+
+    def hysteresis(self) -> HysteresisState | None:
+        """What is known of the actuators; None = nothing."""
+        with self._host.controller() as (controller, now):
+            return controller.observer.estimate(now.time).state
+
     def _missing(self) -> str:
         needed = self._needed
         return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
@@ -162,15 +153,14 @@ class LoopBench(BenchServices):
                 left -= 1
 
 
-def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[WorkerActionServer, ...]:
+def serve_loops(node: FocusHost, values: Mapping[str, Any]) -> None:
     """Offer both actions, one goal at a time. What they run is loaded with the first goal: most mirrors never see one.
 
     Args:
         node: the hosting node.
         values: its parameters, LOOP_PARAMETERS among them.
-        host: judges requests and knows the calibration in use.
     """
-    bench = LoopBench(node, values, host)
+    bench = LoopBench(node, values)
     store = node.create_client(StoreRecipes, "store_recipes")
     calibration = qos.watch(node, "calibration", Calibration, "calibration", qos.LATCHED)
 
@@ -184,7 +174,5 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
 
         return RecipeRun(bench, store, calibration).run(handle)
 
-    return (
-        WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),
-        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes, fields=BUILD_RECIPES),
-    )
+    WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE)
+    WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes, fields=BUILD_RECIPES)

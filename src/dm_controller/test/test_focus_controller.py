@@ -44,7 +44,7 @@ from dm_controller.focus_types import (
     SendCommand,
     StartDegauss,
 )
-from dm_controller.loop_actions import LoopHost
+from dm_controller.loop_actions import LoopBench
 
 ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3
 #: Of the actuators, in aperture radii.
@@ -315,10 +315,11 @@ def test_where_nothing_is_reachable_capabilities_say_so(bench: Bench) -> None:
 
 
 def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
-    host = LoopHost(cast(Any, SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))))
-    assert host.target(FocusRequest(curvature=0.01)).curvature == 0.01
+    host = SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))
+    loop = cast(Any, SimpleNamespace(_host=host))
+    assert LoopBench.target(loop, FocusRequest(curvature=0.01)).curvature == 0.01
     with pytest.raises(Refusal, match="reachable:") as refused:
-        host.target(FocusRequest(curvature=9.0))
+        LoopBench.target(loop, FocusRequest(curvature=9.0))
     assert refused.value.error_code == ErrorCode.UNREACHABLE
     assert not (bench.commands or bench.outcomes)
 

@@ -1,7 +1,7 @@
 """A goal of the action `converge`: bring the surface to a request in closed loop on the interferometer.
 
-The host judges the request as for an open-loop move and knows calibration and mirror. The loop itself is
-`dm_controller.converge.closed_loop`; driver and interferometer are reached through services.
+The request is judged as for an open-loop move. The loop itself is `dm_controller.converge.closed_loop`; driver and
+interferometer are reached through services.
 """
 
 import math
@@ -24,7 +24,7 @@ class ConvergeRun:
     """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
-        bench: its host judges requests and knows the calibration in use.
+        bench: judges requests and knows the calibration in use.
     """
 
     def __init__(self, bench: LoopBench) -> None:
@@ -53,7 +53,7 @@ class ConvergeRun:
     def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> LoopResult:
         bench = self._bench
         options = self._options(goal)
-        target = bench.host.target(goal.request)
+        target = bench.target(goal.request)
         solver = self._solver(goal.method)
         bench.check_ready()
         try:
@@ -65,9 +65,9 @@ class ConvergeRun:
 
     def _creep(self) -> Creep | None:
         """By the law in use and what is known of the actuators; without a law of creep, by the configured rate."""
-        bench, law = self._bench, self._bench.host.active_calibration().planner.law
+        bench, law = self._bench, self._bench.active_calibration().planner.law
         if law.creep_rate:
-            state = bench.host.hysteresis()
+            state = bench.hysteresis()
             return Creep(law, state, bench.now) if state is not None else None
         # A mirror that is not known to stand somewhere gives no move to foresee creep from.
         applied = bench.applied()
@@ -80,7 +80,7 @@ class ConvergeRun:
         )
 
     def _solver(self, method: str) -> Solver:
-        active = self._bench.host.active_calibration()
+        active = self._bench.active_calibration()
         weights = active.calibration.region_weights
         return make_solver(method, active.mirror.model, active.mirror.limits, weights if len(weights) else None)
 

@@ -35,8 +35,7 @@ class RecipeRun:
     """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
-        bench: its host knows the calibration in use and the actuators' hysteresis; REACHABLE_TOLERANCE is among its
-            parameters.
+        bench: knows the calibration in use and the actuators' hysteresis; REACHABLE_TOLERANCE is among its parameters.
         store: client of the service `store_recipes`.
         calibration: tells whether the node that serves it is alive.
     """
@@ -68,7 +67,7 @@ class RecipeRun:
         """
         goal, bench = handle.request, self._bench
         options = self._options(goal)
-        active = bench.host.active_calibration()
+        active = bench.active_calibration()
         planner, calibration = active.planner, active.calibration
         targets = recipe_targets(goal.curvatures, goal.conic_constant, goal.zernike, planner, options.reachable)
         steps = self._values["recipes.degauss_steps"]
@@ -85,7 +84,7 @@ class RecipeRun:
             bench,
             bench.now,
             options,
-            state=bench.host.hysteresis() or self._guess(planner.law, bench.now(), active.middle),
+            state=bench.hysteresis() or self._guess(planner.law, bench.now(), active.middle),
             on_step=report,
             cancelled=bench.cancelled,
         )
