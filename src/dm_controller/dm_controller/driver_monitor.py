@@ -129,16 +129,12 @@ class DriverMonitor:
         is_open = report is not None and report.driver_state == ActuatorState.STATE_ACTIVE and not report.holder
         self.open_until = self._heard + limit if is_open and not self.gone else -math.inf
 
-    def age(self, now: float) -> float:
-        """s since the driver's last report."""
-        return now - self._heard
-
     def silent(self, now: float) -> str:
         """That the driver does not report any more, as a sentence; "" = it does, or never did."""
         if self.gone:
             return self.gone
         limit = self._values["driver_timeout"]
-        age = self.age(now)
+        age = now - self._heard
         if self.latest is None or not limit or age <= limit:
             return ""
         return f"pdm_driver has not reported for {age:.1f} s (driver_timeout {limit:g} s): is it running?"

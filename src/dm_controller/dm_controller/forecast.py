@@ -19,8 +19,8 @@ from dm_common.errors import ErrorCode
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.mirror_model import InfluenceModel, response
+from dm_controller.planning.target import FocusTarget, Shape
 
 #: Number of curvatures over the reachable range for which the share of hysteresis is fetched.
 GRID = 11
@@ -61,12 +61,11 @@ def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> Hy
 
 def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
     """Rms surface control error that figure and influence function alone predict: sag less nominal surface G s, m."""
-    nominal = basis(model.sample_x, model.sample_y) @ (model.influence_zernike @ signals)
-    error = model.sag_offset + model.influence_sag @ signals - nominal
-    root = np.sqrt(model.sample_weight)
-    plane = np.linalg.qr(root[:, np.newaxis] * np.column_stack((np.ones_like(root), model.sample_x, model.sample_y)))[0]
-    weighted = root * error
-    return float(np.linalg.norm(weighted - plane @ (plane.T @ weighted)))
+    from dm_controller.solvers.base import rms_sag  # a start does not wait for it
+
+    moved = response(model, signals)
+    nominal = basis(model.sample_x, model.sample_y) @ moved.coefficients
+    return rms_sag(Shape(model.zernike_offset, model.sag_offset + moved.sag - nominal), model)
 
 
 class ForecastClient:

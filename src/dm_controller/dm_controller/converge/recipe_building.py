@@ -193,7 +193,7 @@ class RecipeBuilder:
         # While it swings about the middle, creep follows the middle.
         self.state = law.advance(law.degaussed(self.state, began, self._middle), self._now())
         move = self._loop.plan(target, self.state, self._now(), effective=aim, ahead=self._options.settle_time)
-        applied = plant.apply(move.plan.signals)
+        applied = plant.apply(move.signals)
         self.state = law.move(self.state, applied, self._now())
         missed = law.effective(law.advance(self.state, self._now() + self._options.settle_time)) - aim
         worst, denied = int(np.abs(missed).argmax()), response(self._loop.mirror.model, missed).max_zernike

@@ -143,18 +143,13 @@ class Planner:
         travel = 0.0
         if state is not None:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
-        if self.hysteresis is None:
-
-            def predict_linear() -> Plan:
-                plan = mirror.predict(target, aim)
-                return plan if error is None else replace(plan, max_zernike=largest, max_zernike_upper=error)
-
-            return Move(target, aim, aim, largest, known, travel + ahead, predict_linear)
         if state is None:
             state, known = law.demagnetised(len(aim), time, mirror.limits.middle), False
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
-        signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None)
+        signals, missed = aim, None
+        if self.hysteresis is not None:
+            signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None)
         reached = aim
         if missed is not None and np.abs(missed).max() > MISSED_MAX:
             if effective is None:

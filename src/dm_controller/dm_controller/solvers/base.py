@@ -15,7 +15,7 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.limits import SLACK, Limits
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.mirror_model import InfluenceModel
@@ -62,8 +62,7 @@ def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> 
 
 def rms_sag(shape: Shape, model: InfluenceModel) -> float:
     """Area-weighted rms sag of a shape, piston and tilt removed, m."""
-    sag = remove_piston_tilt(shape.sag[None, :], points_of(model))[0]
-    return float(np.sqrt(model.sample_weight @ sag**2))
+    return float(rms(remove_piston_tilt(shape.sag[None, :], points_of(model)), model.sample_weight)[0])
 
 
 class Solver(ABC):
