@@ -38,6 +38,8 @@ ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
 NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
 #: Half the step that the slope of the law is taken over.
 SLOPE_STEP = 1e-4
+#: What no Duhem operators add.
+NOTHING = np.zeros((1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,29 +91,48 @@ class Pieces:
         radius: (R,) half-widths, rising.
         polynomial: (D + 1, 2, 1 or N, R) coefficients by rising power of the sum over the operators 0 .. k that have
             set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
-        single: (D + 1, 1 or N, R) the same of each operator alone, in its own value.
-        order: that sorts the law's operators; None = they are sorted.
         fading: what Duhem operators add; None = there are none.
     """
 
     def __init__(self, law: HysteresisModel) -> None:
         order = np.argsort(law.play_radius, kind="stable")
-        self.order = None if (np.diff(order) == 1).all() else order
+        self._order = None if (np.diff(order) == 1).all() else order
         self.radius = law.play_radius[order]
         weight = np.moveaxis(law.play_weight.reshape(-1, *law.play_weight.shape[-2:])[:, order], 2, 0)
-        self.single = np.concatenate((np.zeros((1, *weight.shape[1:])), weight))
-        powers = len(self.single)
+        self._single = np.concatenate((np.zeros((1, *weight.shape[1:])), weight))  # of each alone, in its own value
+        powers = len(self._single)
         self.polynomial = np.zeros((powers, 2, *weight.shape[1:]))
         for way, sign in enumerate((-1.0, 1.0)):
             # What has set in follows the signal at the distance of its half-width: (s - sign r)^power.
             for power in range(powers):
                 for low in range(power + 1):
                     self.polynomial[low, way] += (
-                        comb(power, low) * (-sign * self.radius) ** (power - low) * self.single[power]
+                        comb(power, low) * (-sign * self.radius) ** (power - low) * self._single[power]
                     )
         self.polynomial = self.polynomial.cumsum(axis=-1)
         self.fading = law.fading
         self.powers = np.arange(1.0, powers)[:, None]
+
+    def added(self, state: HysteresisState, there: Floats, sign: Floats) -> tuple[Floats, Floats]:
+        """What Duhem operators add to value and slope of the law at `there`, see `FadingHysteresis.along`."""
+        if self.fading is None:
+            return NOTHING, NOTHING
+        return self.fading.along(state.fading, state.signals, there, sign)
+
+    def onsets(self, state: HysteresisState, sign: Floats, polynomial: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Signals (..., N, R) at which operators set in, the law there, what Duhem operators add to its slope, and what
+        the operators that have not set in yet add to the law (N, R).
+
+        Args:
+            sign: 1 where the way rises, -1 where it falls.
+            polynomial: (D + 1, ..., N or 1, R) of these ways.
+        """
+        play = state.play if self._order is None else state.play[:, self._order]
+        value = horner(self._single, play)
+        waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)
+        onset = play + sign * self.radius
+        added, rise = self.added(state, onset, sign)
+        return onset, horner(polynomial, onset) + waiting + added, rise, waiting
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
         """Signals for the static effective signals `wanted` (N,)."""
@@ -124,15 +145,9 @@ class Pieces:
             return self._newton(
                 state, wanted, sign, polynomial, none, start, np.maximum(near, low), np.minimum(far, high)
             )
-        play = state.play if self.order is None else state.play[:, self.order]
-        value = horner(self.single, play)
-        waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
-        onset = play + sign[:, None] * self.radius
         rows = np.arange(len(wanted))
         laws = rows if self.polynomial.shape[2] > 1 else np.zeros_like(rows)
-        at_onset = horner(self.polynomial[:, way, laws], onset) + waiting
-        if self.fading is not None:
-            at_onset += self.fading.along(state.fading, state.signals, onset, sign[:, None])[0]
+        onset, at_onset, _, waiting = self.onsets(state, sign[:, None], self.polynomial[:, way, laws])
         still = sign[:, None] * (wanted[:, None] - at_onset)
         last = len(self.radius) - 1
         piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
@@ -162,9 +177,9 @@ class Pieces:
         gap = wanted
         for _ in range(ROUNDS_MAX):
             value = horner(polynomial, signals) + fixed
-            slope = horner(derivative, signals) if len(derivative) > 1 else derivative[0]
+            slope = horner(derivative, signals)
             if self.fading is not None:
-                added, rise = self.fading.along(state.fading, state.signals, signals[:, None], sign[:, None])
+                added, rise = self.added(state, signals[:, None], sign[:, None])
                 value, slope = value + added[:, 0], slope + rise[:, 0]
             gap = value - wanted
             below = gap < 0.0

@@ -33,6 +33,8 @@ EXACT = 1e-5
 APART = 1e3
 #: Powers of q that are kept.
 ORDERS = 4
+#: Signs of a falling and of a rising way, as `Pieces.polynomial` has them.
+WAYS = np.array([-1.0, 1.0])[:, None, None]
 #: Largest |q| at the rim for which the series is used: what is left out is below 14/512 q^4, 3e-18 of the whole.
 Q_MAX = 1e-4
 
@@ -123,9 +125,7 @@ class PreparedInverse:
         self._law, self._share, self._lag = law, np.atleast_2d(law.creep_share), np.atleast_2d(law.lag_share)
         self._rounds = LAG_ROUNDS if law.lag_spectrum.size else 1
         self._gap = self._share * (state.crept - state.position[:, None])
-        lags = self._lag.shape[1]
-        if lags:
-            self._gap[:, :lags] += self._lag * (state.lagged - state.signals[:, None])
+        self._gap[:, : self._lag.shape[1]] += self._lag * (state.lagged - state.signals[:, None])
         self._apart = state.signals - state.position
         self._rests: dict[float, tuple[Floats, Floats, Floats]] = {}
         parts = pieces(law)
@@ -136,49 +136,34 @@ class PreparedInverse:
 
     def _prepare(self, parts: Pieces) -> None:
         """Pieces are counted way by way, falling first, then by actuator, then as operators set in."""
-        state = self.state
-        play = state.play if parts.order is None else state.play[:, parts.order]
-        value = horner(parts.single, play)
-        waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
-        sign = np.array([-1.0, 1.0])[:, None, None]
-        begin = play + sign * parts.radius
-        curve = parts.polynomial
-        first = horner(curve, begin) + waiting
-        fading = None
-        if parts.fading is not None:
-            fading = parts.fading.along(state.fading, state.signals, begin, sign)
-            first += fading[0]
-        if len(curve) == 2 and fading is None:
+        curve, count = parts.polynomial, len(self.state.signals)
+        begin, first, steeper, waiting = parts.onsets(self.state, WAYS, curve)
+        if len(curve) == 2 and parts.fading is None:
             slope = 1.0 / np.broadcast_to(curve[1], begin.shape)
             self._table = np.stack((begin, first, slope), axis=-1).reshape(-1, 3)
         else:
-            self._table = self._cubics(parts, begin, first, waiting, fading)
-        rows = APART * np.arange(2.0 * len(play))
-        self._falling, self._rising = rows[: len(play)], rows[len(play) :]
-        places = (sign * first).reshape(len(rows), -1)
+            self._table = self._cubics(parts, begin, first, steeper, waiting)
+        rows = APART * np.arange(2.0 * count)
+        self._falling, self._rising = rows[:count], rows[count:]
+        places = (WAYS * first).reshape(len(rows), -1)
         places[:, 0] = -0.5 * APART  # nothing lies before the state itself
         self._places = (places + rows[:, None]).ravel()
 
-    def _cubics(
-        self, parts: Pieces, begin: Floats, first: Floats, waiting: Floats, fading: tuple[Floats, Floats] | None
-    ) -> Floats:
-        """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact."""
-        state, sign = self.state, np.array([-1.0, 1.0])[:, None, None]
-        ends = np.array([[self._low], [self._high]])
-        curve = parts.polynomial
+    def _cubics(self, parts: Pieces, begin: Floats, first: Floats, steeper: Floats, waiting: Floats) -> Floats:
+        """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact.
+
+        Args:
+            begin, first, steeper, waiting: as `Pieces.onsets` returns them.
+        """
+        ends, curve = np.array([[self._low], [self._high]]), parts.polynomial
         slopes = curve[1:] * parts.powers[:, :, None, None]
         # A piece ends where the next one begins, the last one at the limit.
         end, last = np.empty_like(begin), np.empty_like(begin)
         end[..., :-1], end[..., -1] = begin[..., 1:], ends
         last[..., :-1], last[..., -1] = first[..., 1:], horner(curve[..., -1], ends)
-        steep_first, steep_last = (
-            horner(slopes, at) if len(slopes) > 1 else np.broadcast_to(slopes[0], at.shape).copy()
-            for at in (begin, end)
-        )
-        if parts.fading is not None and fading is not None:
-            after = parts.fading.along(state.fading, state.signals, end, sign)
-            last[..., -1] += after[0][..., -1]
-            steep_first, steep_last = steep_first + fading[1], steep_last + after[1]
+        added, steeper_last = parts.added(self.state, end, WAYS)
+        last[..., -1] += added[..., -1]
+        steep_first, steep_last = horner(slopes, begin) + steeper, horner(slopes, end) + steeper_last
         with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last
@@ -187,8 +172,7 @@ class PreparedInverse:
             middle = 0.5 * rise
             way = ((cube * middle + square) * middle + one) * middle
             error = horner(curve, begin + way) + waiting - first - middle
-            if parts.fading is not None:
-                error += parts.fading.along(state.fading, state.signals, begin + way, sign)[0]
+            error += parts.added(self.state, begin + way, WAYS)[0]
         cube[~(np.abs(error) <= EXACT)] = np.nan
         return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
 
