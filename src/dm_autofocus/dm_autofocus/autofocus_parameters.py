@@ -9,8 +9,8 @@ from dm_autofocus.search.defocus_model import FocusLens
 from dm_autofocus.search.peak_search import NOISE_POINTS, SearchConfig
 from dm_autofocus.search.tracking import TrackConfig
 from dm_autofocus.sharpness import METRICS, check_region
-from dm_common.ros.parameters import AUTOSTART, Parameter, parameters_of, real, reals, switch, text, whole
-from dm_common.values import from_values
+from dm_common.ros.parameters import AUTOSTART, Parameter, parameters_of
+from dm_common.values import from_values, real, reals, switch, text, whole
 
 PARAMETERS: Final = (
     AUTOSTART,

@@ -11,8 +11,8 @@ from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of, real, switch, text, whole
-from dm_common.values import from_values
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of
+from dm_common.values import from_values, real, switch, text, whole
 
 PARAMETERS = (
     AUTOSTART,

@@ -13,8 +13,8 @@ from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
-from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of, real, switch, text
-from dm_common.values import from_values
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of
+from dm_common.values import from_values, real, switch, text
 
 PARAMETERS = (
     AUTOSTART,

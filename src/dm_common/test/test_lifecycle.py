@@ -15,8 +15,9 @@ from rclpy.parameter import Parameter as RosParameter
 from dm_common.errors import ErrorCode
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.lifecycle import ERROR, OK, WARN, ManagedNode
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
+from dm_common.values import real, whole
 from ros_fixtures import Observer
 from waiting import wait_until
 

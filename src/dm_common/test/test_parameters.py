@@ -11,19 +11,8 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from dm_common.ros.parameters import (
-    REQUIRED,
-    Parameter,
-    ParameterError,
-    declare,
-    frame_id,
-    parameters_of,
-    real,
-    reals,
-    text,
-    whole,
-)
-from dm_common.values import from_values, live_parameter, parameter
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, frame_id, parameters_of
+from dm_common.values import from_values, live_parameter, parameter, real, reals, text, whole
 from ros_fixtures import Observer
 
 TABLE = (

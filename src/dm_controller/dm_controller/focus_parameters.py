@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Final
 
-from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, switch, text, whole
-from dm_common.values import Fields, reals
+from dm_common.ros.parameters import AUTOSTART, Parameter, live
+from dm_common.values import Fields, real, reals, switch, text, whole
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
 

@@ -3,19 +3,8 @@
 import math
 from typing import Final
 
-from dm_common.ros.parameters import (
-    AUTOSTART,
-    REQUIRED,
-    Parameter,
-    live,
-    parameters_of,
-    real,
-    reals,
-    switch,
-    text,
-    whole,
-    wholes,
-)
+from dm_common.ros.parameters import AUTOSTART, REQUIRED, Parameter, live, parameters_of
+from dm_common.values import real, reals, switch, text, whole, wholes
 from dm_driver.degauss import STEPS_MAX
 from dm_driver.electronics import BACK_ENDS, ElectronicsSettings
 from dm_driver.electronics.frame_format import FrameFormat

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dm_common.ros.parameters import Parameter, parameters_of, real, text, whole, wholes
-from dm_common.values import from_values
+from dm_common.ros.parameters import Parameter, parameters_of
+from dm_common.values import from_values, real, text, whole, wholes
 from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.camera import CameraConfig
 from dm_simulation.electronics.drive_unit import DriveConfig

@@ -18,24 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from dm_common.errors import Refusal, unknown_name
-from dm_common.values import Value, real, reals, switch, text, texts, whole, wholes
-
-__all__ = [
-    "REQUIRED",
-    "Parameter",
-    "ParameterError",
-    "Values",
-    "declare",
-    "live",
-    "parameters_of",
-    "real",
-    "reals",
-    "switch",
-    "text",
-    "texts",
-    "whole",
-    "wholes",
-]
+from dm_common.values import Value, switch
 
 _TYPES: dict[type | str, RosParameter.Type] = {
     bool: RosParameter.Type.BOOL,
