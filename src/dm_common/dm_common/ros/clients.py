@@ -216,7 +216,8 @@ class MirrorHolder:
             finally:
                 self._timer.cancel()
                 if self.lost is None:
-                    self._release()
+                    with suppress(ServiceCallError):  # the driver is gone
+                        self._ask(HoldMirror.Request.RELEASE, RELEASE_S, self._gone)
         finally:
             self._one.release()
 
@@ -232,12 +233,6 @@ class MirrorHolder:
                 raise Refusal(ErrorCode.BUSY, busy)
             self.lost = Refusal(ErrorCode.PREEMPTED, "a newer run of the same node has taken the mirror over")
             time.sleep(0.02)
-
-    def _release(self) -> None:
-        try:
-            self._ask(HoldMirror.Request.RELEASE, RELEASE_S, self._gone)
-        except ServiceCallError:
-            pass  # the driver is gone
 
     def _ask(self, operation: int, timeout_s: float, cancelled: Callable[[], bool]) -> Any:
         self._request.operation = operation

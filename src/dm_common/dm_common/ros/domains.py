@@ -6,7 +6,6 @@ import os
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
-from typing import IO
 
 #: Where DDS puts the ports of a domain: this many of them for each, from the base on.
 PORT_BASE, PORTS = 7400, 250
@@ -59,18 +58,12 @@ def own_domain() -> Iterator[int]:
     folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
     folder.mkdir(exist_ok=True)
     for domain in range(1, 100):
-        handle: IO[str] = (folder / str(domain)).open("w")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            handle.close()
-            continue
-        if domain in inhabited_domains():
-            handle.close()
-            continue
-        try:
-            yield domain
-        finally:
-            handle.close()
-        return
+        with (folder / str(domain)).open("w") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if domain not in inhabited_domains():
+                yield domain
+                return
     raise RuntimeError("no free ROS domain: 99 runs at once?")

@@ -114,30 +114,27 @@ def _serve_rest_of_batch(executor: Executor) -> None:
 class StopOnSignals:
     """Turns SIGINT and SIGTERM into a flag and wakes the executor, so that no callback is interrupted half way.
 
-    Install it after the executor was made: that one sets handlers of its own.
+    Made after the executor, which sets handlers of its own.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, executor: Executor) -> None:
         self.requested = False
         # Python runs a handler when the main thread is back from the executor's C++ code; a byte in this pipe fetches
         # it from there.
-        self._reader, writer = os.pipe()
+        reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         for number in STOPPING:
             signal.signal(number, self._on_signal)
 
-    def _on_signal(self, _number: int, _frame: object) -> None:
-        self.requested = True
-
-    def wake(self, executor: Executor) -> None:
-        """Wake `executor` at every signal from now on."""
-
-        def watch() -> None:
-            while os.read(self._reader, 1):
+        def wake() -> None:
+            while os.read(reader, 1):
                 executor.create_task(lambda: None)
 
-        threading.Thread(target=watch, daemon=True).start()
+        threading.Thread(target=wake, daemon=True).start()
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self.requested = True
 
 
 class BackgroundExecutor:
@@ -209,8 +206,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         executor = make_executor(node)
-        signals = StopOnSignals()
-        signals.wake(executor)
+        signals = StopOnSignals(executor)
         # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()
         gc.freeze()

@@ -216,8 +216,7 @@ class ManagedNode(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._done(self._release)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._done(self._release)
+    on_shutdown = on_cleanup
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         trouble = self._trouble
