@@ -138,13 +138,20 @@ def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
     )
 
 
-def _of_actuators(name: str, values: array[float], *shape: int) -> Floats:
-    """A field that has this shape for all actuators alike, or once for each of them; empty = there is none."""
-    field, one = np.array(values, dtype=np.float64), math.prod(shape)
-    if field.size and (not one or field.size % one):
-        wanted = " x ".join(map(str, shape))
-        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {wanted} (for each)")
-    return field.reshape(-1, *shape) if field.size > one else field.reshape(shape) if field.size else field
+def _shaped(name: str, values: array[float], *shape: int, own: bool = False) -> Floats:
+    """A field of the hysteresis model of this shape, in which -1 is any length; empty = there is none.
+
+    Args:
+        own: whether it may be there once for each actuator.
+    """
+    field = np.array(values, dtype=np.float64)
+    if not field.size:
+        return field
+    try:
+        return field.reshape(-1, *shape) if own and field.size > math.prod(shape) else field.reshape(shape)
+    except ValueError:
+        wanted = " x ".join("any" if length < 0 else str(length) for length in shape) + (" (for each)" if own else "")
+        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {wanted}") from None
 
 
 def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None:
@@ -156,44 +163,30 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     radius = np.array(message.play_radius, dtype=np.float64)
     if not radius.size:
         return None
-    weight = _of_actuators("play_weight", message.play_weight, radius.size, message.powers)
+    weight = _shaped("play_weight", message.play_weight, radius.size, message.powers, own=True)
     if not weight.size:
         raise ValueError(f"hysteresis: play_weight has 0 values, must be {radius.size} x {message.powers} (for each)")
     duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
-    duhem_slope = np.array(message.duhem_slope, dtype=np.float64)
-    if duhem_weight.size > 1 and duhem_slope.size % (2 * duhem_weight.size):
-        raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {duhem_weight.size} x 2 x A")
+    slope_of = (duhem_weight.size, 2, -1) if duhem_weight.size > 1 else (-1,)
     own, rate = weight.shape[:-2], np.array(message.fading_rate, dtype=np.float64)
     creep_time = np.array(message.creep_time, dtype=np.float64)
-    covariance = np.array(message.creep_covariance, dtype=np.float64)
-    if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
-        raise ValueError(
-            f"hysteresis: creep_covariance has {covariance.size} values, must be {2 * (1 + creep_time.size) ** 2}"
-        )
+    count = creep_time.size
     return HysteresisModel(
         radius,
         weight,
-        duhem_slope.reshape(duhem_weight.size, 2, -1) if duhem_weight.size > 1 and duhem_slope.size else duhem_slope,
+        _shaped("duhem_slope", message.duhem_slope, *slope_of),
         duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
         creep_time,
-        _of_actuators("creep_spectrum", message.creep_spectrum, creep_time.size),
+        _shaped("creep_spectrum", message.creep_spectrum, count, own=True),
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
-        covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
-        _rows_of_any_length("lag_spectrum", message.lag_spectrum, *own),
+        _shaped("creep_covariance", message.creep_covariance, 2, 1 + count, 1 + count),
+        _shaped("lag_spectrum", message.lag_spectrum, *own, -1),
         message.creep_slope,
         rate,
-        _rows_of_any_length("fading_weight", message.fading_weight, *own, rate.size) if rate.size else np.zeros((0, 0)),
+        _shaped("fading_weight", message.fading_weight, *own, rate.size, -1) if rate.size else np.zeros((0, 0)),
     )
-
-
-def _rows_of_any_length(name: str, values: array[float], *shape: int) -> Floats:
-    """A field that has rows of this shape, of any length; empty = there is none."""
-    field = np.array(values, dtype=np.float64)
-    if field.size % math.prod(shape):
-        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {' x '.join(map(str, shape))} x any")
-    return field.reshape(*shape, -1) if field.size else field
 
 
 #: Fields of HysteresisState that a dm_msgs/ActuatorEstimate has under the same names.
