@@ -55,6 +55,8 @@ SPECTRUM_CORRELATION = 12.0
 #: Loops are followed otherwise than the rest by elements of up to so many seconds: prior standard deviation of that.
 LAG_S, LAG = 30.0, 0.02
 LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
+#: Weights of creep: of its elements, and of what those that follow loops add; the last is the change of creep.
+ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
 #: Rounds of the three solutions in turn, of runs of so many maps. With 6 the slow creep is a third less true and
@@ -103,12 +105,13 @@ class OwnLaws:
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
-        self._linear = 0
         if candidate.slopes:
-            linear = np.zeros((len(FADING_RATE), FADING_POWERS))
-            self._linear = linear.size
-            columns.append(self._fading(FadingHysteresis(rates=FADING_RATE, drive=linear)))
+            linear = FadingHysteresis(rates=FADING_RATE, drive=np.zeros((len(FADING_RATE), FADING_POWERS)))
+            columns.append(self._fading(linear))
         self._plain = np.concatenate(columns, axis=1)
+        #: Which features are patterns of the play operators, and which linear Duhem operators.
+        first = 1 + self._basis.shape[1]
+        self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         count = signals.shape[1]
         self._between = _alike(count, SPREAD)
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
@@ -136,16 +139,16 @@ class OwnLaws:
             patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.
             creep = np.zeros((len(self._creep_root), actuators))
-            creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
+            creep[ELEMENTS] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
             if slope.size and own_fading:
                 slope = padded_slope(slope, actuators)
                 changes = self.run.along(lambda signals: fading_changes(signals, slope))
                 changing = np.concatenate((self._features(slope), changes), axis=1)
                 patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
-                own = len(patterns) - 2 * slope.shape[2]
-                slope = own_slopes(slope, patterns[own - 1], patterns[own:])
-                patterns = patterns[:own]
+                own = self._linear.stop
+                slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
+                patterns = patterns[: own + 1]
         patterns, creep, scatter, residual = self._rounds(self._features(slope), keep, patterns, creep, scatter)
         return OwnFit(self.candidate, self._law(patterns, creep, slope), residual, patterns, creep, scatter)
 
@@ -163,11 +166,10 @@ class OwnLaws:
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after some solutions in turn."""
-        more = features.shape[1] - self._plain.shape[1]
-        sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(self._linear, FADING_WEIGHT)))
-        sigma = np.concatenate((sigma, np.full(min(more, 1), DUHEM_WEIGHT)))
-        sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
-        root = np.diag(sigma)
+        sigma = np.full(features.shape[1], DUHEM_CHANGE)
+        sigma[: self._linear.stop + 1] = DUHEM_WEIGHT
+        sigma[self._linear], sigma[self._patterned] = FADING_WEIGHT, 1.0
+        root = np.diag(sigma[1:])
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
         free = basis_of(self.run.figure[keep])
         crept = self._with_creep(features, creep, patterns)
@@ -185,15 +187,15 @@ class OwnLaws:
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
         """The law of the weights (F, N) and (J + L + 1, N), effective signals spanning 2 in a full cycle."""
-        count, orders = self._basis.shape[1], self.candidate.powers
-        series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), orders)
-        powers = np.zeros((orders, orders + 1))
-        for order in range(1, orders + 1):
-            powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(orders + 1)[order, : order + 1])
-        play_weight = series @ powers[:, 1:]
+        orders = self.candidate.powers
+        series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(self.radius), orders)
+        powers = [
+            np.pad(legendre.leg2poly([0.0] * order + [1.0]), (0, orders - order)) for order in range(1, orders + 1)
+        ]
+        play_weight = series @ np.array(powers)[:, 1:]
         play_weight[:, 0, 0] += patterns[0]
-        fading = patterns[1 + count : 1 + count + self._linear].T.reshape(-1, len(FADING_RATE), FADING_POWERS)
-        share, lag = np.maximum(creep[: len(CREEP_TIMES)].T, 0.0), creep[len(CREEP_TIMES) : -1].T
+        linear = patterns[self._linear].T
+        share, lag = np.maximum(creep[ELEMENTS].T, 0.0), creep[LAGGED].T
         mean = float(share.mean())
         share[:, :LAGS] += lag
         return normalised(
@@ -207,8 +209,8 @@ class OwnLaws:
                 share / mean if mean else np.zeros(0),
                 lag_spectrum=-lag / mean if mean else np.zeros(0),
                 creep_slope=float(creep[-1].mean()),
-                fading_rate=FADING_RATE if self._linear else NONE,
-                fading_weight=fading if self._linear else NO_DRIVE,
+                fading_rate=FADING_RATE if linear.size else NONE,
+                fading_weight=linear.reshape(-1, len(FADING_RATE), FADING_POWERS) if linear.size else NO_DRIVE,
             )
         )
 
@@ -216,11 +218,10 @@ class OwnLaws:
         """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""
         if not creep.any():
             return features
-        count = len(CREEP_TIMES)
-        loops = creep[:count].copy()
-        loops[:LAGS] += creep[count:-1]
+        loops = creep[ELEMENTS].copy()
+        loops[:LAGS] += creep[LAGGED]
         added = self.run.crept(features, loops[:, None])
-        added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[:count])
+        added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[ELEMENTS])
         slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
         return features * (1.0 + slope[:, None]) + added
 
@@ -246,11 +247,10 @@ class OwnLaws:
         elements = np.concatenate((elements, lags), axis=1)
         sloped = position * np.einsum("mjn,jn->mn", elements, creep[:-1])
         elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
-        count = len(CREEP_TIMES)
-        left = measured - (position[keep] + self._creep * elements[:, :count].sum(axis=1)) @ gains
+        left = measured - (position[keep] + self._creep * elements[:, ELEMENTS].sum(axis=1)) @ gains
         elements, left = without(elements, free), without(left, free)
         found = weights_of(elements, left, gains, self._creep_root, self._creep_between)
-        found[:count] += self._creep
+        found[ELEMENTS] += self._creep
         return found
 
 
