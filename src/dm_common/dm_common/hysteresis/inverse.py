@@ -91,6 +91,7 @@ class Pieces:
         radius: (R,) half-widths, rising.
         polynomial: (D + 1, 2, 1 or N, R) coefficients by rising power of the sum over the operators 0 .. k that have
             set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
+        derivative: (D, 2, 1 or N, R) likewise, of its slope.
         fading: what Duhem operators add; None = there are none.
     """
 
@@ -111,7 +112,8 @@ class Pieces:
                     )
         self.polynomial = self.polynomial.cumsum(axis=-1)
         self.fading = law.fading
-        self.powers = np.arange(1.0, powers)[:, None]
+        self._powers = np.arange(1.0, powers)[:, None]
+        self.derivative = self.polynomial[1:] * self._powers[..., None, None]
 
     def added(self, state: HysteresisState, there: Floats, sign: Floats) -> tuple[Floats, Floats]:
         """What Duhem operators add to value and slope of the law at `there`, see `FadingHysteresis.along`."""
@@ -173,7 +175,7 @@ class Pieces:
         high: Floats,
     ) -> Inverted:
         """The root between `low` and `high` (N,) of what rises there, or the end that comes nearest to it."""
-        derivative = polynomial[1:] * self.powers
+        derivative = polynomial[1:] * self._powers
         gap = wanted
         for _ in range(ROUNDS_MAX):
             value = horner(polynomial, signals) + fixed
@@ -193,19 +195,6 @@ class Pieces:
 
 #: A law never changes, so what is worked out from it is kept.
 pieces = lru_cache(maxsize=8)(Pieces)
-
-
-@dataclass(frozen=True, eq=False)
-class Constrained:
-    """A legal command.
-
-    Attributes:
-        signals: (N,) inside all limits.
-        effective: (N,) effective signals that it leads to.
-    """
-
-    signals: Floats
-    effective: Floats
 
 
 def within(limits: Limits) -> Limits:
@@ -230,11 +219,14 @@ class ConstrainedInverse:
         self._near = NEAR * float(np.linalg.norm(self._root, 2)) * np.eye(matrix.shape[1])
         self._project = orthogonal[: len(matrix)].T
 
-    def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> Constrained:
+    def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> tuple[Floats, Floats]:
         """The legal command at the state's time whose rows, `ahead` s later, come nearest to `rows` (M,).
 
         Args:
             start: (N,) signals to begin with, for instance those of the inverse without limits between neighbours.
+
+        Returns:
+            (N,) signals inside all limits, and (N,) the effective signals that they lead to.
         """
         wanted = self._project @ rows
         law, limits = self._law, self._limits
@@ -269,7 +261,7 @@ class ConstrainedInverse:
             least, near = missed(effective), near * (LESS_NEAR if gained > 0.0 else NEARER)
             if np.abs(step).max() <= CONVERGED or 0.0 < gained < GAINED * least:
                 break
-        return Constrained(signals, effective)
+        return signals, effective
 
 
 #: Random histories that tell what is always within reach, their moves, and the time between those, s.

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.duhem import FadingHysteresis
-from dm_common.hysteresis.inverse import certain_reach
+from dm_common.hysteresis.duhem import FadingHysteresis, horner
+from dm_common.hysteresis.inverse import certain_reach, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
@@ -20,32 +20,27 @@ PLACES = 41
 def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> float:
     """Smallest slope of the effective signal over signals of `low` .. `high`, on any way.
 
-    After a turn the operators set in one by one, narrow ones first; what has set in follows the signal at a
-    distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
+    After a turn the operators set in one by one, narrow ones first; those of half-width r have set in only where the
+    turn can lie 2 r behind.
     """
-    order = np.argsort(law.play_radius)
-    radius, weight = law.play_radius[order], law.play_weight[..., order, :]
-    signals, way = np.linspace(low, high, PLACES), np.array([1.0, -1.0])[:, None, None]
-    behind = np.where(way > 0.0, signals[:, None] - low, high - signals[:, None])
-    value = signals[:, None] - way * radius
-    weight = weight[..., None, None, :, :]  # a row for each way and signal
-    slope = np.zeros(np.broadcast_shapes(value.shape, weight.shape[:-1]))
-    for power in range(weight.shape[-1], 0, -1):
-        slope = slope * value + power * weight[..., power - 1]
-    slope = np.cumsum(np.where(2.0 * radius <= behind, slope, 0.0), axis=-1)  # of each number that have set in
-    if law.fading is not None:
-        slope = slope + _fading_slope(law.fading, law.actuators or 1, signals, radius)
-    return float(slope.min())
+    parts = pieces(law)
+    signals = np.linspace(low, high, PLACES)
+    behind = np.stack((high - signals, signals - low))[:, None, :, None]  # on a falling and on a rising way
+    slope = horner(parts.derivative[..., None, :], signals[:, None])  # of each number of operators that have set in
+    if parts.fading is not None:
+        slope = slope + _fading_slope(parts.fading, law.actuators or 1, signals, parts.radius)
+    dead_zone = 0.0 if parts.radius[0] else np.inf  # before anything has set in, also without an end
+    return float(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min())
 
 
 def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:
-    """(N, 2, S, R) smallest slope of what fades at `signals` (S,), on both ways, at least 2 `radius` (R,) after a turn
-    that a full swing led to; infinite where no turn lies so far behind.
+    """(2, N, S, R) smallest slope of what fades at `signals` (S,), on falling and rising ways, at least 2 `radius` (R,)
+    after a turn that a full swing led to; infinite where no turn lies so far behind.
     """
     count, step = len(signals), signals[1] - signals[0]
     apart = np.minimum((2.0 * radius / step).astype(int), count - 1)
     smallest = []
-    for way in (1, -1):
+    for way in (-1, 1):
         met = signals[::way]
         states, at = np.zeros((actuators, fading.size)), np.full(actuators, met[0])
         for end in (met[-1], met[0], met[-1]):
@@ -58,7 +53,7 @@ def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, rad
             slopes[np.arange(count - turn), np.arange(turn, count)] = slope.T
         later = np.minimum.accumulate(slopes[::-1], axis=0)[::-1]
         smallest.append(later[apart][:, ::way])
-    return np.stack(smallest).transpose(3, 0, 2, 1)
+    return np.stack(smallest).transpose(0, 3, 2, 1)
 
 
 def span(law: HysteresisModel) -> Floats:

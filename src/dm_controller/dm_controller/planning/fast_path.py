@@ -156,14 +156,14 @@ class PreparedInverse:
             begin, first, steeper, waiting: as `Pieces.onsets` returns them.
         """
         ends, curve = np.array([[self._low], [self._high]]), parts.polynomial
-        slopes = curve[1:] * parts.powers[:, :, None, None]
         # A piece ends where the next one begins, the last one at the limit.
         end, last = np.empty_like(begin), np.empty_like(begin)
         end[..., :-1], end[..., -1] = begin[..., 1:], ends
         last[..., :-1], last[..., -1] = first[..., 1:], horner(curve[..., -1], ends)
         added, steeper_last = parts.added(self.state, end, WAYS)
         last[..., -1] += added[..., -1]
-        steep_first, steep_last = horner(slopes, begin) + steeper, horner(slopes, end) + steeper_last
+        steep_first = horner(parts.derivative, begin) + steeper
+        steep_last = horner(parts.derivative, end) + steeper_last
         with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last

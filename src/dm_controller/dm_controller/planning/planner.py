@@ -188,8 +188,8 @@ class Planner:
         if np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
             return inverted.signals, None
         wanted = self.mirror.matrix @ aim if target is None else self.mirror.rows(*self.mirror.wanted(target))
-        nearest = self._constrained.solve(at, wanted, ahead, inverted.signals)
-        return nearest.signals, aim - nearest.effective
+        signals, reached = self._constrained.solve(at, wanted, ahead, inverted.signals)
+        return signals, aim - reached
 
     def hold(self, state: HysteresisState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
