@@ -6,8 +6,6 @@ its commands, (X'X)^-1 sigma^2 each; what they do to the check moves of the run 
 Features are those of the richest candidate, which costs most maps. What no number of maps takes away is a floor.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,28 +31,9 @@ DRAWS = 4000
 RESOLVED = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class ExpectedAccuracy:
-    """What a run promises of moves that it has not seen.
-
-    Attributes:
-        sigma: (K - 3,) standard deviation of the coefficients beyond tilt, m; without an influence function (N,)
-            of the effective signals, normalised by the noise of one map.
-        max_zernike: 95 % quantile of the largest of them, in the same unit; compares with
-            `HysteresisFit.held_out_max_zernike`.
-    """
-
-    sigma: Floats
-    max_zernike: float
-
-
 def expected_accuracy(
-    signals: Floats,
-    time: Floats,
-    check: NDArray[np.bool_],
-    noise: float = TYPICAL_NOISE,
-    influence: Floats | None = None,
-) -> ExpectedAccuracy:
+    signals: Floats, time: Floats, check: NDArray[np.bool_], noise: float, influence: Floats
+) -> float:
     """The expected error of the check moves of a run that begins with a degauss just before its first map.
 
     Args:
@@ -62,8 +41,11 @@ def expected_accuracy(
         time: (M,) s, when the maps will be taken.
         check: (M,) which moves test the law.
         noise: standard deviation of a coefficient of one map, m.
-        influence: (K, N) m per unit signal, from any earlier calibration; None = not known: every actuator counts as
-            seen by itself.
+        influence: (K, N) m per unit signal, from any earlier calibration.
+
+    Returns:
+        95 % quantile of the largest coefficient error beyond tilt, m; compares with
+        `HysteresisFit.held_out_max_zernike`.
 
     Raises:
         TooFewMapsError: no check moves, or fewer other maps than actuators and features.
@@ -76,14 +58,13 @@ def expected_accuracy(
     if (~check).sum() <= gains.shape[1]:
         raise TooFewMapsError(f"{(~check).sum()} maps: must be more than {gains.shape[1]} to tell gains and figure")
     share = _leverage(gains[~check], gains[check]).mean()
-    response = np.eye(signals.shape[1]) if influence is None else influence[PISTON_TILT:].T
-    scale, floor = (1.0, 0.0) if influence is None else (noise, FLOOR)
+    response = influence[PISTON_TILT:].T
     # Gains of every response are a regression of their own; the weights are shared by all.
-    covariance = np.eye(response.shape[1]) * (share * scale**2 + floor**2)
+    covariance = np.eye(response.shape[1]) * (share * noise**2 + FLOOR**2)
     features = _features(signals, time, start)
     free = np.linalg.qr(gains[~check, :3])[0]
-    covariance += scale**2 * _shared_error(without(features[~check], free), features[check], response)
-    return ExpectedAccuracy(np.sqrt(np.diag(covariance)), largest_of(covariance))
+    covariance += noise**2 * _shared_error(without(features[~check], free), features[check], response)
+    return largest_of(covariance)
 
 
 def largest_of(covariance: Floats) -> float:

@@ -102,7 +102,7 @@ def forecast(
             found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
         except TooFewMapsError:  # nor does the run end there
             continue
-        expected = Forecast(float(time[part - 1]), max(found.max_zernike, float(law / np.sqrt(part))), part)
+        expected = Forecast(float(time[part - 1]), max(found, float(law / np.sqrt(part))), part)
         if expected.max_zernike <= until:
             break
     return expected
