@@ -60,7 +60,10 @@ def test_a_smaller_aperture_of_the_mirror_is_cut_out() -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"coefficients": [0.0] * 20}, "topic /wavefront: coefficients: 20, must be 21"),
+        (
+            {"coefficients": [0.0] * 20},
+            r"topic /wavefront: coefficients of shape \(20,\): the last axis must have 21 terms",
+        ),
         ({"convention": "fringe", "coefficients": [0.0] * 26}, "must have at least 27 terms"),
         ({"convention": "zernike"}, "convention = 'zernike': must be one of born_wolf, noll, ansi, fringe"),
         ({"coefficients": [np.nan] * 21}, "must be finite"),

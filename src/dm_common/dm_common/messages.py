@@ -18,6 +18,7 @@ from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_common.limits import Limits
 from dm_common.mirror import Applied, Mirror
+from dm_common.optics.zernike import BORN_WOLF
 from dm_common.recipes import Recipe, RecipeBook
 
 if TYPE_CHECKING:
@@ -85,8 +86,6 @@ def mirror_from(message: MirrorInfo) -> Mirror:
 #: Fields of Measurement that dm_msgs/SurfaceMapInfo and dm_msgs/ZernikeCoefficients have under the same names.
 OF_FILE = ("reference_surface", "instrument_error", "scale_error", "instrument", "pitch", "system_error_subtracted")
 OF_FIT = ("residual_rms", "radius", "wavelength")
-#: Order and normalisation of coefficients here, by its name in dm_msgs/ZernikeCoefficients.
-BORN_WOLF = "born_wolf"
 
 
 def measurement_from(response: Any) -> Measurement:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dm_calibration.optics.map_fit import MapFitter
 from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
-from dm_common.optics.zernike import TERMS, basis, noll_to_born_wolf
+from dm_common.optics.zernike import TERMS, basis, to_born_wolf
 from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
 from studies.paper.regions import ConcentricRegions, residual_map, squared_distance
@@ -133,14 +133,14 @@ def _hcipy_fit(mask: NDArray[np.bool_], hcipy: Any) -> Fit:
     x, y = _unit_grid()
     grid = hcipy.CartesianGrid(hcipy.UnstructuredCoords([x[mask], y[mask]]))
     modes = hcipy.make_zernike_basis(len(TERMS), 2.0 + 1e-9, grid)
-    return lambda sag: noll_to_born_wolf(modes.coefficients_for(sag[mask]))
+    return lambda sag: to_born_wolf(modes.coefficients_for(sag[mask]), "noll")
 
 
 def _zernike_fit(mask: NDArray[np.bool_], zernike: Any) -> Fit:
     """RZern of the package zernike: normal equations over the pixels of the unit disc."""
     terms = zernike.RZern(5)
     terms.make_cart_grid(*_unit_grid())
-    return lambda sag: noll_to_born_wolf(terms.fit_cart_grid(sag)[0])
+    return lambda sag: to_born_wolf(terms.fit_cart_grid(sag)[0], "noll")
 
 
 _RIVALS: dict[str, Callable[[NDArray[np.bool_], Any], Fit]] = {

@@ -1,11 +1,9 @@
 """Maps and measurements as ROS messages."""
 
 import array
-from collections.abc import Callable
 
 import numpy as np
 from dm_msgs.msg import SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
-from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -13,22 +11,8 @@ from dm_calibration.acquisition.sensor import PIXELS, Seen, disc_terms
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.measurement import Measurement
-from dm_common.messages import BORN_WOLF, OF_FILE, OF_FIT, doubles, taken
-from dm_common.optics.zernike import TERMS, ansi_to_born_wolf, fringe_to_born_wolf, noll_to_born_wolf
-
-
-def _born_wolf(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    if coefficients.shape != (len(TERMS),):
-        raise ValueError(f"coefficients: {coefficients.size}, must be {len(TERMS)}")
-    return coefficients
-
-
-_TO_BORN_WOLF: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    BORN_WOLF: _born_wolf,
-    "noll": noll_to_born_wolf,
-    "ansi": ansi_to_born_wolf,
-    "fringe": fringe_to_born_wolf,
-}
+from dm_common.messages import OF_FILE, OF_FIT, doubles, taken
+from dm_common.optics.zernike import BORN_WOLF, CONVENTIONS, to_born_wolf
 
 
 def image_message(surface: SurfaceMap, header: Header) -> Image:
@@ -79,12 +63,11 @@ def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
         MapRejectedError: an unknown convention, too few terms, or values that are not finite.
     """
     radius, wavelength = message.radius, message.wavelength
-    convert = _TO_BORN_WOLF.get(message.convention or BORN_WOLF)
-    if convert is None:
-        known = ", ".join(_TO_BORN_WOLF)
-        raise MapRejectedError(f"{source}: convention = {message.convention!r}: must be one of {known}")
+    convention = message.convention or BORN_WOLF
+    if convention not in CONVENTIONS:
+        raise MapRejectedError(f"{source}: convention = {convention!r}: must be one of {', '.join(CONVENTIONS)}")
     try:
-        coefficients = convert(np.array(message.coefficients, dtype=np.float64))
+        coefficients = to_born_wolf(message.coefficients, convention)
     except ValueError as error:
         raise MapRejectedError(f"{source}: {error}") from error
     if not np.isfinite([*coefficients, radius, wavelength]).all():

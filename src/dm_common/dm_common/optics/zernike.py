@@ -155,29 +155,26 @@ def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = Fals
     return values
 
 
-_FROM_NOLL = np.array([term.noll_index - 1 for term in TERMS])
-_FROM_ANSI = np.array([term.ansi_index for term in TERMS])
-_FROM_FRINGE = np.array([term.fringe_index - 1 for term in TERMS])
+#: Order and normalisation of coefficients here, by its name in dm_msgs/ZernikeCoefficients.
+BORN_WOLF = "born_wolf"
+#: By its name: where the order of a convention has each term, and the rms of the term where it is normalised by that.
+CONVENTIONS: dict[str, tuple[NDArray[np.intp], Floats | float]] = {
+    BORN_WOLF: (np.arange(len(TERMS)), 1.0),
+    "noll": (np.array([term.noll_index - 1 for term in TERMS]), TERM_RMS),
+    "ansi": (np.array([term.ansi_index for term in TERMS]), TERM_RMS),
+    "fringe": (np.array([term.fringe_index - 1 for term in TERMS]), 1.0),
+}
 
 
-def noll_to_born_wolf(coefficients: ArrayLike) -> Floats:
-    """(..., 21) or more, rms-normalised, Noll index 1 on, to (..., 21) peak-normalised in Born & Wolf's order."""
-    return _from_order(coefficients, _FROM_NOLL) / TERM_RMS
+def to_born_wolf(coefficients: ArrayLike, convention: str) -> Floats:
+    """Coefficients in one of the CONVENTIONS to (..., 21) in Born & Wolf's; terms beyond order 5 are left out.
 
-
-def ansi_to_born_wolf(coefficients: ArrayLike) -> Floats:
-    """(..., 21) or more, rms-normalised, OSA/ANSI index 0 on, to (..., 21) peak-normalised in Born & Wolf's order."""
-    return _from_order(coefficients, _FROM_ANSI) / TERM_RMS
-
-
-def fringe_to_born_wolf(coefficients: ArrayLike) -> Floats:
-    """(..., 27) or more in Fringe order to (..., 21) in Born & Wolf's, peak-normalised both."""
-    return _from_order(coefficients, _FROM_FRINGE)
-
-
-def _from_order(coefficients: ArrayLike, position: NDArray[np.intp]) -> Floats:
-    """Terms beyond order 5 are left out."""
-    return _checked(coefficients, int(position.max()) + 1, more=True)[..., position]
+    Args:
+        coefficients: (..., 21) of Born & Wolf's; (..., 21) or more of Noll's from index 1 on, or of OSA/ANSI's from
+            index 0 on, both rms-normalised; (..., 27) or more of Fringe's.
+    """
+    place, rms = CONVENTIONS[convention]
+    return _checked(coefficients, int(place.max()) + 1, more=convention != BORN_WOLF)[..., place] / rms
 
 
 def tilt_influence(measured: Floats, places: Floats, response: Floats) -> Floats:
