@@ -45,7 +45,7 @@ class DuhemOperator:
             raise ValueError(f"duhem_slope = {slope.tolist()}: must be one or more finite numbers")
         self._own = slope.ndim == 3
         rows = np.arange(slope.size // slope.shape[-1])
-        self._polynomial = np.vstack((np.ones(len(rows)), -slope.reshape(len(rows), -1).T, np.zeros(len(rows))))
+        self._polynomial = np.vstack((np.ones(len(rows)), -slope.reshape(len(rows), -1).T))
         z = np.linspace(-REACH, REACH, KNOTS)
         f = polyval(z, self._polynomial)  # (rows, KNOTS)
         passable = np.maximum(f, SLOPE_MIN)
@@ -84,11 +84,7 @@ class DuhemOperator:
     def rise(self, z: Floats, way: Floats) -> Floats:
         """dz/du at the state z, on a way that rises (`way` 1) or falls (-1); shapes as in :meth:`move`."""
         along = way * z
-        rows = self._rows(np.broadcast_to(way, along.shape))
-        total = self._polynomial[-1][rows]
-        for coefficient in self._polynomial[-2::-1]:
-            total = total * along + coefficient[rows]
-        return np.asarray(total)
+        return horner(self._polynomial[:, self._rows(np.broadcast_to(way, along.shape))], along)
 
 
 def horner(coefficients: Floats, x: Floats) -> Floats:
