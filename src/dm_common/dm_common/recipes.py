@@ -8,7 +8,7 @@ later time and creep. On a mirror without an identified model they are the signa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,12 +98,7 @@ class RecipeBook:
         """
         self.check_condition(newer.degauss_steps)
         both = {recipe.shape: recipe for recipe in (*self.recipes, *newer.recipes)}
-        return RecipeBook(
-            tuple(both[key] for key in sorted(both)),
-            newer.degauss_steps,
-            newer.interpolation_error,
-            newer.stamp_ns,
-        )
+        return replace(newer, recipes=tuple(both[shape] for shape in sorted(both)))
 
 
 def terms_text(zernike: Sequence[float]) -> str:

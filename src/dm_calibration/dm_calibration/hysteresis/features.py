@@ -84,8 +84,7 @@ def fading_features(signals: Floats, operators: FadingHysteresis) -> Floats:
 
 def padded_slope(slope: Floats, actuators: int) -> Floats:
     """(N, 2, A) coefficients of a Duhem operator that begins as `slope` (A,), A being at least DUHEM_ORDERS."""
-    padded = np.zeros(max(DUHEM_ORDERS, len(slope)))
-    padded[: len(slope)] = slope
+    padded = np.pad(slope, (0, max(DUHEM_ORDERS - len(slope), 0)))
     return np.tile(padded, (actuators, 2, 1))
 
 
