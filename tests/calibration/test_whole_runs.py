@@ -23,6 +23,7 @@ from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo_bench import bench_config
+from dm_tools.verbs.up import shared_config
 from fault_injection.rigs.forked_node import ForkedSuite
 from support import fast_bench, wait_until
 
@@ -136,11 +137,19 @@ def test_a_bench_whose_processes_are_all_interrupted_at_once_ends_in_order(tmp_p
 
 
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
-    """The demo as a user runs it, with a folder and figures of the test's."""
+    """The demo as a user runs it, with a folder, figures and a smaller camera of the test's; reports: elsewhere."""
+    config = load_config(shared_config("bench.yaml"))
+    config["virtual_bench"]["interferometer.pixels"] = 472
+    config["calibration"]["write_report"] = False
+    bench = tmp_path / "bench.yaml"
+    save_config(config, bench)
     figures = tmp_path / "demo.json"
-    command = [sys.executable, "-m", "dm_tools", "demo", "--hysteresis", "off", "--seed", "2012"]
+    command = [sys.executable, "-m", "dm_tools", "demo", "--config", str(bench), "--hysteresis", "off"]
     done = subprocess.run(
-        [*command, "--out", str(tmp_path / "run"), "--json", str(figures)], capture_output=True, text=True, timeout=400
+        [*command, "--seed", "2012", "--out", str(tmp_path / "run"), "--json", str(figures)],
+        capture_output=True,
+        text=True,
+        timeout=400,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     content = json.loads(figures.read_text())
