@@ -187,13 +187,14 @@ def run() -> Iterator[Answer]:
     """Every case, asked of a bench of this run's own."""
     from dm_client import DeformableMirrorClient
     from dm_common.ros.domains import own_domain
-    from dm_tools.demo.demo_bench import bench_config, running_bench
+    from dm_tools.demo.demo_bench import bench_config, quick_trigger, running_bench
 
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
         folder = Path(temporary)
         config = bench_config(folder, "off", 0.0, 3, 5.0)
-        config["virtual_bench"]["interferometer.pixels"] = 236
+        config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.05}
         config["virtual_bench"] |= {"camera.rate": 5.0, "camera.width": 64, "camera.height": 48}
+        config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
         config["autofocus"] = {"optics.rest_distance": 10.0, "use_sim_time": True}
         config["calibration"] |= {"write_report": False, "settle_time": 0.1}
         with running_bench(config, folder, domain, DeformableMirrorClient) as client:

@@ -33,10 +33,9 @@ from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
-from dm_tools.demo.demo_bench import bench_config
+from dm_tools.demo.demo_bench import bench_config, quick_trigger
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
-from fault_injection.rigs.common_steps import quick_trigger
 from studies.documentation.parameters import TABLES
 from support import wait_until
 
@@ -284,7 +283,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         (folder / name).symlink_to(ROOT / name)
     home = folder / "home"
     config = bench_config(folder / "bench", "drawn_preisach", 0.01, 1, 5.0)  # the shipped mirror in fast time
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.05}
     config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
     home.mkdir()

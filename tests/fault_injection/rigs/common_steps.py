@@ -19,15 +19,6 @@ from fault_injection.rigs.driver_rig import PATIENCE_S, DriverRig
 
 #: A held shape is corrected for creep: signals that differ less are the same shape.
 SAME_SHAPE = 0.04
-#: As dm_simulation.interferometer.trigger: ask the virtual bench on port $0 for a map in the file $1.
-_ASK = """
-exec 3<>"/dev/tcp/127.0.0.1/$0" && echo "MEASURE $1" >&3 && read -r answer <&3 && echo "$answer" && [[ $answer = OK* ]]
-"""
-
-
-def quick_trigger(port: int | str) -> list[str]:
-    """For the parameter `trigger_command`: starts ten times as fast as the shipped program, which runs elsewhere."""
-    return ["bash", "-c", _ASK, str(port), "{path}"]
 
 
 @contextmanager
