@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +22,8 @@ _CORES = os.cpu_count() or 1
 WORKERS = min(2 * _CORES, 12)
 #: Little of the others is waiting; each worker imports the modules of all tests, which takes some ten seconds.
 FAST_WORKERS = _CORES + (_CORES + 1) // 2
+#: Takes a minute and more of one core in a fresh checkout: only of what the tests leave.
+_TYPES = ["nice", "-n", "19", sys.executable, "-m", "mypy"]
 SCHEDULE = ("--dist", "loadfile", "--no-loadscope-reorder")
 
 
@@ -36,30 +39,40 @@ def test(
     """
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
     chosen = any(not argument.startswith("-") for argument in context.args)
-    steps = {}
     lint = not fast and not chosen if lint is None else lint
-    if lint:
-        steps["ruff check"] = ["ruff", "check", "."]
-        steps["ruff format"] = ["ruff", "format", "--check", "."]
-        steps["mypy"] = ["mypy"]
+    steps = {"ruff check": ["ruff", "check", "."], "ruff format": ["ruff", "format", "--check", "."]} if lint else {}
     workers = FAST_WORKERS if fast else 0 if chosen else WORKERS
     steps["pytest"] = ["pytest", "-n", str(workers), *SCHEDULE, *(["-m", FAST] if fast else []), *context.args]
     environment = _environment(root)
-    results: dict[str, dict[str, float | int]] = {}
-    compiling = _compile(root, environment) if lint else None
-    for name, command in steps.items():
-        if name == "pytest" and compiling is not None:
-            compiling.wait()
-        console.rule(name)
-        started = time.monotonic()
-        status = subprocess.run([sys.executable, "-m", *command], cwd=root, env=environment, check=False).returncode
-        results[name] = {"status": status, "seconds": round(time.monotonic() - started, 1)}
+    results: dict[str, dict[str, float]] = {}
+    found = ""
+    with ThreadPoolExecutor() as beside:
+        types = beside.submit(_run, _TYPES, root, environment, stdout=subprocess.PIPE, text=True) if lint else None
+        compiling = _compile(root, environment) if lint else None
+        for name, command in steps.items():
+            if name == "pytest" and compiling is not None:
+                compiling.wait()
+                console.print("mypy goes on beside the tests; what it finds is shown after them")
+            console.rule(name)
+            _, results[name] = _run([sys.executable, "-m", *command], root, environment)
+        if types is not None:
+            found, results["mypy"] = types.result()
     # pytest's own summary must stay the last thing on the screen when all is well.
     failed = [name for name, result in results.items() if result["status"] != 0]
+    if "mypy" in failed:
+        console.rule("mypy")
+        console.print(found, markup=False)
     write_json(json, {"checks": results})
     if failed:
         console.print(f"[bold red]failed:[/] {', '.join(failed)}")
         raise typer.Exit(1)
+
+
+def _run(command: list[str], root: Path, environment: dict[str, str], **output: Any) -> tuple[str, dict[str, float]]:
+    """Run a check; what it said, where `output` keeps that, and its figures."""
+    started = time.monotonic()
+    done = subprocess.run(command, cwd=root, env=environment, check=False, **output)
+    return done.stdout, {"status": done.returncode, "seconds": round(time.monotonic() - started, 1)}
 
 
 def _compile(root: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
