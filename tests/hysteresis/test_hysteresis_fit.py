@@ -106,7 +106,10 @@ def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() ->
     for turns, (shape, when, count) in enumerate(zip(maps.applied, moved, degausses, strict=True), start=3):
         before = tracker.state
         assert before is not None
-        tracker.observe(Applied(max(float(when), law.crept_at), shape, turns, before.signals, int(count), True))
+        when = max(float(when), law.crept_at)
+        if count > degausses[turns - 4]:  # it sets off for the degauss
+            tracker.observe(Applied(when, before.signals, turns - 1, before.signals, int(count) - 1, True, moving=True))
+        tracker.observe(Applied(when, shape, turns, before.signals, int(count), True))
     assert tracker.state is not None
     found = law.effective(law.advance(tracker.state, 1e-9 * int(maps.stamp_ns[-1])))
     np.testing.assert_allclose(found, effective.applied[-1], atol=2e-5)

@@ -33,9 +33,8 @@ CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
 #: The most creep per decade of time that a law may have.
 CREEP_RATE_MAX = 0.2
 #: How much more a request may err, where there is hysteresis, than the held-out moves of the calibration, which follow
-#: each other within seconds: requests after a degauss err 1.2 to 2.6 times as much as the same law does on those moves.
-#: Linear Duhem operators make those moves a fifth to a third better, what creep leaves of requests not.
-IN_USE, IN_USE_FADING = 1.4, 1.6
+#: each other within seconds: requests, which are held for longer, err 1.2 to 2.6 times as much.
+IN_USE = 1.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +143,7 @@ class HysteresisModel:
     @property
     def in_use(self) -> float:
         """What the error of held-out moves is multiplied by for what requests are promised."""
-        if not self.has_history:
-            return 1.0
-        return IN_USE_FADING if self.fading_rate.size else IN_USE
+        return IN_USE if self.has_history else 1.0
 
     @cached_property
     def is_identity(self) -> bool:
