@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
-from scipy.optimize import lsq_linear
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.limits import Limits
@@ -126,8 +125,7 @@ def test_terms_that_no_actuator_moves_do_not_spoil_the_surface(curvature: float)
     root = np.sqrt(model.sample_weight)
     matrix = root[:, None] * remove_piston_tilt(model.influence_sag.T, points).T
     right = root * remove_piston_tilt(wanted[None, :], points)[0]
-    triangle_q, triangle = np.linalg.qr(1e6 * matrix)
-    best = lsq_linear(triangle, triangle_q.T @ (1e6 * right), bounds=(-1, 1), method="bvls").x
+    best = np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
     limit = float(np.linalg.norm(matrix @ best - right))
     assert limit <= plan.rms < 1.2 * limit
     assert not plan.saturated.any()
