@@ -18,10 +18,11 @@ from dm_calibration import calibrator
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.procedure import forecast
-from dm_tools.demo.demo_bench import bench_config, quick_trigger
+from dm_tools.demo.demo_bench import bench_config
 from fault_injection.rigs.forked_node import ForkedNode, ForkedSuite
 from ros_fixtures import Observer
 from waiting import wait_until
+from studies.quick_trigger import quick_trigger
 
 __all__ = [
     "CommonLawsSuite",

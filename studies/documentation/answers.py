@@ -187,7 +187,8 @@ def run() -> Iterator[Answer]:
     """Every case, asked of a bench of this run's own."""
     from dm_client import DeformableMirrorClient
     from dm_common.ros.domains import own_domain
-    from dm_tools.demo.demo_bench import bench_config, quick_trigger, running_bench
+    from dm_tools.demo.demo_bench import bench_config, running_bench
+    from studies.quick_trigger import quick_trigger
 
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
         folder = Path(temporary)

@@ -33,11 +33,12 @@ from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
-from dm_tools.demo.demo_bench import bench_config, quick_trigger
+from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
 from studies.documentation.parameters import TABLES
 from support import wait_until
+from studies.quick_trigger import quick_trigger
 
 pytestmark = pytest.mark.processes
 

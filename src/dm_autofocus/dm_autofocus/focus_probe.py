@@ -8,7 +8,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -191,10 +191,12 @@ class FocusProbe:
         self._check = check
         purpose = f"action {action}; cancel it to end it"
         try:
-            with self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]):
+            with ExitStack() as stack:
+                try:
+                    stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
+                except ServiceCallError as error:
+                    raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
                 yield
-        except ServiceCallError as error:
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
         finally:
             self.target = math.nan
             self._other_request = None

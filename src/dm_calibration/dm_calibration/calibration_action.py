@@ -30,7 +30,6 @@ from dm_common.values import without_figures
 FEEDBACK_PERIOD_S = 0.1
 
 _PHASES = {
-    StepKind.DEGAUSS: "degauss",
     StepKind.POKE: "pokes",
     StepKind.SURFACE: "surfaces",
     StepKind.EXCITATION: "hysteresis",
@@ -197,16 +196,18 @@ class CalibrateAction:
     def _report(self, phase: str, label: str, step: int) -> None:
         feedback = self._feedback
         feedback.phase, feedback.label, feedback.step = phase, label, step
-        left = step_times(self._plan.steps[step : self._end], self._services.settle_time, self._services.map_time)
-        feedback.maps_left, feedback.time_left = len(left), float(left.sum())
+        left = self._plan.steps[step : self._end]
+        feedback.maps_left = sum(each.kind is not StepKind.DEGAUSS for each in left)
+        feedback.time_left = float(step_times(left, self._services.settle_time, self._services.map_time).sum())
         if time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
             self._sent = time.monotonic()
             self._handle.publish_feedback(feedback)
 
     def _report_progress(self, now: Progress) -> None:
         self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms
-        # Reference frames belong to the phase around them.
-        self._report(_PHASES.get(now.kind, self._feedback.phase), now.label, now.done)
+        # Reference frames, and a degauss in the course of a run, belong to the phase around them.
+        phase = _PHASES.get(now.kind, self._feedback.phase) if now.done else "degauss"
+        self._report(phase, now.label, now.done)
 
     def _report_reached(self, reached: float, maps: int) -> None:
         """Tell what the run has reached (m) after a part of so many maps, and what is left."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
+from dm_calibration.procedure.outcome import MapTaken
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
 from dm_common.errors import Cancelled, Refusal
@@ -24,8 +28,14 @@ def bench(mirror: Mirror) -> LinearBench:
     return LinearBench(mirror)
 
 
-def run(bench: LinearBench, mirror: Mirror, kind: PlanKind = PlanKind.POKES, **options: object) -> Procedure:
-    plan = make_plan(kind, mirror)
+def run(
+    bench: LinearBench,
+    mirror: Mirror,
+    kind: PlanKind = PlanKind.POKES,
+    plan_options: PlanOptions | None = None,
+    **options: object,
+) -> Procedure:
+    plan = make_plan(kind, mirror, plan_options)
     procedure = Procedure(
         plan,
         mirror,
@@ -68,6 +78,28 @@ def test_degausses_in_the_course_of_a_run_begin_no_new_one(bench: LinearBench, m
     again = Procedure(plan, mirror, bench, outcome=outcome).run()
     assert [move.degauss for move in bench.moves].count(True) == 5  # as a run goes on, and its own
     assert again.maps().degaussed.sum() == 2
+
+
+def test_what_a_degauss_wiped_is_no_noise(bench: LinearBench, mirror: Mirror) -> None:
+    """Before one of them comes a reference frame here, of the same command as the map after it."""
+    maps = run(bench, mirror, PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=250)).outcome.maps()
+    first = int(np.flatnonzero(maps.degaussed)[0])
+    assert maps.kind[first - 1] == "reference" and (maps.applied[first] == maps.applied[first - 1]).all()
+    wiped = np.array(maps.coefficients)
+    wiped[first] += 5e-8
+    np.testing.assert_array_equal(replace(maps, coefficients=wiped).noise_variance(), maps.noise_variance())
+
+
+def test_a_reference_frame_may_differ_by_what_a_degauss_wiped(bench: LinearBench, mirror: Mirror) -> None:
+    reference, poke = (MapTaken(record) for record in run(bench, mirror).outcome.records[:2])
+    change = 0.8 * (poke.record.coefficients - reference.record.coefficients)
+    changed = MapTaken(replace(reference.record, coefficients=reference.record.coefficients + change))
+    check = BumpCheck(BumpOptions(tilt_max=0.0), mirror.rest, mirror.limits.half_range)
+    check.take(reference)
+    check.take(poke)
+    assert "the figure changed by" in check.change(changed, False)
+    check.take(MapTaken(replace(reference.record, kind="degaussed")))
+    assert check.change(changed, False) == ""
 
 
 def test_a_failed_measurement_is_tried_again(bench: LinearBench, mirror: Mirror) -> None:

@@ -154,13 +154,17 @@ class Connection:
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
         """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
 
+        found: list[Any] = []
+
         def arrived() -> bool:
             message = self.messages.get(topic)
-            return message is not None and message.header.stamp == stamp
+            if message is not None and message.header.stamp == stamp:
+                found.append(message)  # the next one may come at any moment
+            return bool(found)
 
         if not self.wait(arrived):
             raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
-        return self.messages[topic]
+        return found[0]
 
     def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""

@@ -27,10 +27,11 @@ from dm_simulation.bench import BenchConfig, FilesConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
-from dm_tools.demo.demo_bench import quick_trigger
+
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from fault_injection.rigs.forked_node import Process
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+from studies.quick_trigger import quick_trigger
 
 NODES = ("interferometer", "calibration", "focus_controller")
 #: Of the simulated interferometer.

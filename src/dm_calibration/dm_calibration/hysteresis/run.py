@@ -1,7 +1,9 @@
 """The commands of a calibration run and what its maps say, in parts that each begin with a degauss.
 
-What the actuators did between two parts is not known. A degauss wipes their hysteresis; their creep before it fades
-in a pattern that is unknown, as it is before the first part, and the mirror may have drifted meanwhile.
+A part begins where the run began or was resumed. What the actuators did between two parts is not known. A degauss
+wipes their hysteresis; their creep before it fades in a pattern that is unknown, as it is before the first part, and
+the mirror may have drifted meanwhile. Further degausses within a part wipe hysteresis too, but creep before them is
+known.
 """
 
 from collections.abc import Callable
@@ -67,7 +69,8 @@ class Run:
 
     def along(self, feature: Callable[[Floats], Floats]) -> Floats:
         """A `feature` of signals that begin demagnetised, along the commands."""
-        return np.concatenate([feature(self.signals[rows]) for part, _ in self.parts for rows in self._sequences(part)])
+        sequences = [rows for part, _ in self.parts for rows in self._sequences(part)]
+        return np.concatenate([feature(self.signals[rows]) for rows in sequences])
 
     def _sequences(self, part: slice) -> list[slice]:
         """The rows of a part from one degauss to the next."""

@@ -96,7 +96,8 @@ class MapSet:
     @property
     def degaussed(self) -> NDArray[np.bool_]:
         """(M,) before which maps the mirror was degaussed in the course of the run."""
-        return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool)
+        again = np.concatenate(([False], np.diff(self.step) == 0))
+        return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
     def moved_s(self) -> Floats:
         """(M,) s since the first map: when the mirror took each shape; right after the map before where not known, and
@@ -113,7 +114,7 @@ class MapSet:
         """(K - 3,) m^2 of the coefficients of one map, from maps of the same command that follow each other; 0 where
         these are too few.
         """
-        same = (np.diff(self.applied, axis=0) == 0.0).all(axis=1) & (np.diff(self.segment) == 0)
+        same = (np.diff(self.applied, axis=0) == 0.0).all(axis=1) & (np.diff(self.segment) == 0) & ~self.degaussed[1:]
         change = np.diff(self.coefficients[:, PISTON_TILT:], axis=0)[same]
         change = change[np.isfinite(change).all(axis=1)]
         return 0.5 * np.square(change).mean(axis=0) if len(change) >= PAIRS_MIN else np.zeros(change.shape[1])

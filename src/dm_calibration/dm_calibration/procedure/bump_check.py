@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dm_calibration.influence.maps import REFERENCE
+from dm_calibration.influence.maps import DEGAUSSED, REFERENCE
 from dm_calibration.procedure.outcome import MapTaken
 from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
@@ -50,9 +50,9 @@ class BumpOptions:
 class BumpCheck:
     """Compares each reference frame with the one before it."""
 
-    def __init__(self, options: BumpOptions, rest: Floats) -> None:
-        """`rest`: (N,) signals of the reference frames."""
-        self._options, self._rest = options, rest
+    def __init__(self, options: BumpOptions, rest: Floats, half_range: float) -> None:
+        """`rest`: (N,) signals of the reference frames; `half_range`: how far a degauss goes from there."""
+        self._options, self._rest, self._half_range = options, rest, half_range
         self._last: MapTaken | None = None
         self._moved = np.zeros_like(rest)
         # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
@@ -65,6 +65,8 @@ class BumpCheck:
             self._last = taken
             self._moved = np.zeros_like(self._moved)
             return
+        if record.kind == DEGAUSSED:
+            self.degaussed()
         away = record.applied - self._rest
         self._moved = np.maximum(self._moved, np.abs(away))
         if self._last is not None and np.isfinite(record.coefficients).all():
@@ -72,9 +74,9 @@ class BumpCheck:
             # A common signal lifts the plate without bending it.
             self._commanded += float(np.square(away - away.mean()).sum())
 
-    def swung(self, signal: float) -> None:
-        """All actuators went `signal` away from rest, as in a degauss."""
-        self._moved = np.maximum(self._moved, abs(signal))
+    def degaussed(self) -> None:
+        """All actuators went through their whole range."""
+        self._moved = np.maximum(self._moved, self._half_range)
 
     def change(self, frame: MapTaken, interrupted: bool) -> str:
         """How the reference frame `frame` differs from the one before it; "" = as it should.

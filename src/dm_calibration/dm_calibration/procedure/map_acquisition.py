@@ -58,14 +58,14 @@ class MapAcquisition:
         self._bench, self._mirror, self._options = bench, mirror, options
         self.outcome = outcome
         self._note, self._checkpoint, self._guard = note, checkpoint, guard
-        self._bump = BumpCheck(options.bump, mirror.rest)
+        self._bump = BumpCheck(options.bump, mirror.rest, mirror.limits.half_range)
         self._swung = False
         for record, centre in zip(outcome.records, outcome.centres, strict=True):
             self._bump.take(MapTaken(record, centre=centre))
 
     def swung(self) -> None:
         """The actuators went through their whole range since the last map, nobody knows where the mirror went."""
-        self._bump.swung(self._mirror.limits.half_range)
+        self._bump.degaussed()
         self._swung = True
 
     def take(self, label: str, step: Step, number: int, applied: Floats) -> None:

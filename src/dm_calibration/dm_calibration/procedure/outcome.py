@@ -43,7 +43,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Segment:
-    """The history of the actuators begins anew: after a degauss, or where an interrupted run goes on.
+    """The history of the actuators begins: after the degauss that a run begins with, or goes on with.
 
     Attributes:
         number: 0 for the first.

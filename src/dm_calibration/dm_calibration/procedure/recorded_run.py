@@ -74,7 +74,7 @@ class RecordedBench:
             if self._moves[index].degauss:
                 self._next_move = index + 1
                 return
-        raise RecordingError("the recording ends before the degauss that the run began with")
+        raise RecordingError("the recording ends before a degauss of the run")
 
     def apply(self, signals: Floats) -> Floats:
         """What was written when `signals` were commanded.

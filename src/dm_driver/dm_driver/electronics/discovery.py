@@ -78,4 +78,7 @@ def discover(address: str = BROADCAST, port: int = PORT, timeout_s: float = 1.0)
     """
     with closing(Probe(address, port)) as probe:
         probe.ask()
-        return list({unit.mac: unit for unit in probe.answers(timeout_s)}.values())
+        units: dict[str, Unit] = {}
+        for unit in probe.answers(timeout_s):
+            units.setdefault(unit.mac, unit)
+        return list(units.values())

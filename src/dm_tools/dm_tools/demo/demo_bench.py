@@ -19,11 +19,6 @@ PORTS = range(61000, 65536)
 #: Parameters of a bench whose actuators follow one law.
 SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
 
-#: As dm_simulation.interferometer.trigger: ask the virtual bench on port $0 for a map in the file $1.
-_ASK = """
-exec 3<>"/dev/tcp/127.0.0.1/$0" && echo "MEASURE $1" >&3 && read -r answer <&3 && echo "$answer" && [[ $answer = OK* ]]
-"""
-
 
 class Hysteresis(StrEnum):
     """Hysteresis of the simulated actuators."""
@@ -109,11 +104,6 @@ def bench_config(
         for name in config:
             config[name]["use_sim_time"] = name != "virtual_bench"
     return config
-
-
-def quick_trigger(port: int | str) -> list[str]:
-    """For the parameter `trigger_command`: starts ten times as fast as the shipped program, which runs elsewhere."""
-    return ["bash", "-c", _ASK, str(port), "{path}"]
 
 
 def new_folder(path: Path) -> Path:
