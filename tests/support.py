@@ -21,8 +21,8 @@ from dm_calibration.procedure import forecast
 from dm_tools.demo.demo_bench import bench_config
 from fault_injection.rigs.forked_node import ForkedNode, ForkedSuite
 from ros_fixtures import Observer
-from waiting import wait_until
 from studies.quick_trigger import quick_trigger
+from waiting import wait_until
 
 __all__ = [
     "CommonLawsSuite",

@@ -12,8 +12,8 @@ from dm_msgs.action import Calibrate
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
-from support import CommonLawsSuite, Observer, wait_until
 from studies.quick_trigger import quick_trigger
+from support import CommonLawsSuite, Observer, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 

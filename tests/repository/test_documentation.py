@@ -37,8 +37,8 @@ from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
 from studies.documentation.parameters import TABLES
-from support import wait_until
 from studies.quick_trigger import quick_trigger
+from support import wait_until
 
 pytestmark = pytest.mark.processes
 

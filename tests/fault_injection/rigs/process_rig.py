@@ -27,7 +27,6 @@ from dm_simulation.bench import BenchConfig, FilesConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
-
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from fault_injection.rigs.forked_node import Process
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig

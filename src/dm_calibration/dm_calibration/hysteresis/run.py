@@ -143,7 +143,9 @@ def run_of(maps: MapSet) -> Run:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    return Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment, maps.degaussed)
+    return Run(
+        maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment, maps.degaussed
+    )
 
 
 def basis_of(columns: Floats) -> Floats:

@@ -114,7 +114,9 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     """How long each of `steps` takes, s, where a map takes `map_time` (s) beyond the settle time."""
     return np.array(
         [
-            TYPICAL_DEGAUSS_S if step.kind is StepKind.DEGAUSS else map_time + step.settle_share * settle_time + step.dwell
+            TYPICAL_DEGAUSS_S
+            if step.kind is StepKind.DEGAUSS
+            else map_time + step.settle_share * settle_time + step.dwell
             for step in steps
         ]
     )

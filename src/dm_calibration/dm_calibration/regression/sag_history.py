@@ -62,7 +62,9 @@ class RunHistory:
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
         responses = Responses(self._sag, 0, self._usable)
-        run = Run(maps.applied, time, responses, float(moved[0]) - BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed)
+        run = Run(
+            maps.applied, time, responses, float(moved[0]) - BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed
+        )
         self._plays = run.along(lambda signals: play_features(signals, self._radius, 1))
         self._crept = run.crept(self._plays)
 
