@@ -107,9 +107,11 @@ def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() ->
         before = tracker.state
         assert before is not None
         when = max(float(when), law.crept_at)
-        if count > degausses[turns - 4]:  # it sets off for the degauss
-            tracker.observe(Applied(when, before.signals, turns - 1, before.signals, int(count) - 1, True, moving=True))
-        tracker.observe(Applied(when, shape, turns, before.signals, int(count), True))
+        turned_at = before.signals
+        if maps.degaussed[turns - 3]:
+            tracker.observe(Applied(when, turned_at, turns - 1, turned_at, int(count) - 1, True, moving=True))
+            turned_at = shape
+        tracker.observe(Applied(when, shape, turns, turned_at, int(count), True))
     assert tracker.state is not None
     found = law.effective(law.advance(tracker.state, 1e-9 * int(maps.stamp_ns[-1])))
     np.testing.assert_allclose(found, effective.applied[-1], atol=2e-5)
