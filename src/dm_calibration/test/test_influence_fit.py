@@ -214,13 +214,16 @@ def test_bad_maps_are_dropped_with_their_reason(mirror: Mirror) -> None:
 
 @pytest.mark.parametrize("middle", [-1.0, 0.0, 3.0])
 def test_a_bad_map_is_an_outlier_wherever_mid_range_is(mirror: Mirror, middle: float) -> None:
-    """What hysteresis may explain of a map follows from how far the mirror moved, not from the signals' zero."""
+    """What hysteresis may explain of a map follows from how far the mirror moved, not from the signals' zero.
+
+    Which of the two pokes of an actuator is the bad one they do not show: both lie equally far from their common fit.
+    """
     plant = LinearMirror(mirror.x, mirror.y, noise=1 * NM)
     maps = measure(plant, mirror)
     sag = maps.sag.copy()
     sag[maps.label.index("poke+20")] += 300 * NM * plant.modes[:, 4]
     bad = replace(maps, sag=sag, coefficients=plant.fit_terms(sag), applied=maps.applied + middle)
-    assert reasons_of(fit_influence(bad), bad).keys() == {"poke+20"}
+    assert reasons_of(fit_influence(bad), bad).keys() in ({"poke+20"}, {"poke-20"})
 
 
 def test_hysteresis_is_not_called_an_outlier(mirror: Mirror) -> None:
