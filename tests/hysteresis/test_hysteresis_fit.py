@@ -120,7 +120,7 @@ def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() ->
 def test_a_degauss_in_the_course_of_a_run_wipes_its_loops_and_not_its_creep() -> None:
     """In features, and in the effective signals of a law."""
     rng = np.random.default_rng(5)
-    signals, time = rng.uniform(-1.0, 1.0, (30, 3)), 2.0 * np.arange(30)
+    signals, time = rng.uniform(-1.0, 1.0, (30, 3)), np.linspace(0.0, 58.0, 30)
     degaussed = np.arange(30) == 20
     signals[degaussed] = 0.0
     nothing = Responses(np.zeros((30, 1)), 1, np.ones(30, dtype=bool))
