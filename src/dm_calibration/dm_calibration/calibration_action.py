@@ -112,7 +112,7 @@ class CalibrateAction:
         expected = forecast(plan, settle_time, in_use, self._mirror, taken, goal.until, guessed)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
-            maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
+            maps = expected.maps or sum(step.takes_map for step in plan.steps)
             guess = "" if taken or in_use is not None else f" if a map takes {guessed:g} s (none was taken yet)"
             drawn = in_use is None or in_use.hysteresis is None
             time_text = f"{maps} maps in about {expected.duration:.0f} s{guess}"
@@ -197,7 +197,7 @@ class CalibrateAction:
         feedback = self._feedback
         feedback.phase, feedback.label, feedback.step = phase, label, step
         left = self._plan.steps[step : self._end]
-        feedback.maps_left = sum(each.kind is not StepKind.DEGAUSS for each in left)
+        feedback.maps_left = sum(each.takes_map for each in left)
         feedback.time_left = float(step_times(left, self._services.settle_time, self._services.map_time).sum())
         if time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
             self._sent = time.monotonic()

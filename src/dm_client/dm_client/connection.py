@@ -153,7 +153,6 @@ class Connection:
 
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
         """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
-
         found: list[Any] = []
 
         def arrived() -> bool:

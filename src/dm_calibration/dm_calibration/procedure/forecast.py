@@ -84,9 +84,9 @@ def forecast(
         if earlier is not None and len(earlier.maps) > 1:
             gap = np.diff(np.sort(earlier.maps.stamp_ns)) * 1e-9
             map_time = max(float(np.median(gap)) - settle_time, 0.0)
-    measured = np.array([step.kind is not StepKind.DEGAUSS for step in plan.steps], dtype=bool)
+    measured = np.array([step.takes_map for step in plan.steps], dtype=bool)
     time = np.cumsum(step_times(plan.steps, settle_time, map_time))[measured]
-    steps = [step for step in plan.steps if step.kind is not StepKind.DEGAUSS]
+    steps = [step for step in plan.steps if step.takes_map]
     duration = float(time[-1]) if len(time) else 0.0
     signals = [step.signals for step in steps if step.signals is not None]
     check = np.array([step.kind is StepKind.CHECK for step in steps], dtype=bool)
@@ -114,9 +114,7 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     """How long each of `steps` takes, s, where a map takes `map_time` (s) beyond the settle time."""
     return np.array(
         [
-            TYPICAL_DEGAUSS_S
-            if step.kind is StepKind.DEGAUSS
-            else map_time + step.settle_share * settle_time + step.dwell
+            map_time + step.settle_share * settle_time + step.dwell if step.takes_map else TYPICAL_DEGAUSS_S
             for step in steps
         ]
     )

@@ -69,6 +69,11 @@ class Step:
     settle_share: float = 1.0
 
     @property
+    def takes_map(self) -> bool:
+        """Whether it ends with a map: all but a degauss do."""
+        return self.kind is not StepKind.DEGAUSS
+
+    @property
     def needs_model(self) -> bool:
         """Whether the signals must be solved from an influence function first."""
         return self.kind is StepKind.CHECK or (self.kind is StepKind.SURFACE and self.signals is None)
@@ -142,9 +147,10 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     for part in parts:
         if count:
             ends.add(len(steps))
+        degaussed = part.degaussed
         commands = zip(part.signals, part.dwell, part.settle_share, part.check, strict=True)
         for row, (signals, dwell, share, check) in enumerate(commands):
-            if row in part.degaussed:
+            if row in degaussed:
                 steps.append(Step(f"degauss {count}", StepKind.DEGAUSS))
                 steps.append(Step(f"degaussed {count}", StepKind.DEGAUSSED, mirror.rest))
             count += 1
