@@ -38,7 +38,8 @@ def test_small_changes_of_the_slope_are_found() -> None:
 
 def test_nothing_is_said_of_an_operator_without_weight() -> None:
     common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
-    assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
+    weight, changes = np.full(ACTUATORS, 1e-3), np.full((common[0].size, ACTUATORS), 0.1)
+    assert own_slopes(common, weight, changes) == pytest.approx(common)
 
 
 def test_weights_are_those_of_the_normal_equations() -> None:

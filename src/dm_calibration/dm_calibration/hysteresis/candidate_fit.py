@@ -82,8 +82,8 @@ CANDIDATES = (
     Candidate("Duhem", 0, 3, 4),
     PREISACH_AND_DUHEM,
     Candidate("static, each actuator its own", 0, 5, 0, own=True),
-    Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
-    Candidate("Preisach and Duhem, each actuator its own", 30, 5, 4, own=True),
+    Candidate("Preisach, each actuator its own", 30, 10, 0, own=True),
+    Candidate("Preisach and Duhem, each actuator its own", 30, 10, 4, own=True),
 )
 #: Those of one law for all actuators.
 COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)

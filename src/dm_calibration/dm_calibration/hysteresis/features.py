@@ -18,7 +18,7 @@ RATE_MIN = 1e-3
 #: Residual of the solved weights, relative: effective signals are within 1e-7 then.
 SOLVED = 1e-7
 #: Patterns that are kept of the prior.
-PATTERNS = 40
+PATTERNS = 60
 #: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
 #: errors change by less than a tenth when any of these four is doubled or halved.
 AMPLITUDE, ORDER_POWER = 0.2, 3.0
@@ -26,8 +26,9 @@ AMPLITUDE, ORDER_POWER = 0.2, 3.0
 CORRELATION, DECAY = 0.5, 0.35
 #: Variance of the loading curve beside that of all play operators together.
 LOADING = 0.3
-#: Fewest coefficients of a Duhem operator of its own, and its weight below which nothing can be said of them.
-DUHEM_ORDERS, DUHEM_WEIGHT_MIN = 3, 0.01
+#: Fewest coefficients of a Duhem operator of its own, how often they are found to first order, and its weight below
+#: which nothing can be said of them.
+DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
 #: The step for derivatives by them, and their largest change.
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
 

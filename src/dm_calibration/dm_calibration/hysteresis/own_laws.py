@@ -2,7 +2,7 @@
 
 Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
 any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r; a Gaussian prior
-makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that forty
+makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that sixty
 numbers an actuator describe a law. The patterns of all actuators are drawn towards each other: those that one
 actuator shows badly are the mean of the others. Creep is a spectrum over the elements of the model, smooth over the
 logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum of their own,
@@ -23,6 +23,7 @@ from scipy.linalg import block_diag
 
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
+    DUHEM_ROUNDS,
     PER_ELEMENT,
     fading_changes,
     fading_features,
@@ -143,12 +144,12 @@ class OwnLaws:
             scatter, slope = self._scatter, self._slope
             if slope.size and own_fading:
                 slope = padded_slope(slope, actuators)
-                changes = self.run.along(lambda signals: fading_changes(signals, slope))
-                changing = np.concatenate((self._features(slope), changes), axis=1)
-                patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
                 own = self._linear.stop
-                slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
-                patterns = patterns[: own + 1]
+                for _ in range(DUHEM_ROUNDS):
+                    changing = np.concatenate((self._features(slope), self._changes(slope)), axis=1)
+                    patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
+                    slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
+                    patterns = patterns[: own + 1]
         patterns, creep, scatter, residual = self._rounds(self._features(slope), keep, patterns, creep, scatter)
         return OwnFit(self.candidate, self._law(patterns, creep, slope), residual, patterns, creep, scatter)
 
@@ -157,6 +158,10 @@ class OwnLaws:
         if not slope.size:
             return self._plain
         return np.concatenate((self._plain, self._fading(FadingHysteresis(slope))), axis=1)
+
+    def _changes(self, slope: Floats) -> Floats:
+        """(M, 2 A, N) derivatives of the Duhem operators with `slope` (N, 2, A) by its coefficients."""
+        return self.run.along(lambda signals: fading_changes(signals, slope))
 
     def _fading(self, operators: FadingHysteresis) -> Floats:
         """(M, Z, N) values of Duhem operators along the run."""
