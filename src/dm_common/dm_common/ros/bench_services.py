@@ -120,10 +120,8 @@ class BenchServices:
         A driver that was restarted, or lost its link, takes commands again soon; what was measured before and after
         does not belong together without a degauss between.
         """
-        if self.state is None:
-            return
         was_known = self._history_known
-        self._history_known = self.state.history_known
+        self._history_known = self.state is not None and self.state.history_known
         if was_known and not self._history_known:
             raise Refusal(
                 ErrorCode.DRIVER_UNAVAILABLE,
@@ -132,10 +130,11 @@ class BenchServices:
 
     def degauss(self, steps: int = 0) -> None:
         """As of a bench, of so many half-swings; 0 = as configured in the driver."""
-        self._history_known = False
         goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
         timeout = self._values["degauss_timeout"]
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
+            self.check_history()
+            self._history_known = False
             result = run_goal(self._degauss, goal, timeout, stop=stop, gone=self._driver.since_now())
             if result.error_code != ErrorCode.OK and stop():
                 raise ServiceCallError("degauss: cancelled")
