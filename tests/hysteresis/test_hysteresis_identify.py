@@ -102,10 +102,10 @@ def test_a_richer_law_that_leaves_hardly_less_counts_as_the_simpler(monkeypatch:
 
     monkeypatch.setattr("dm_calibration.hysteresis.identify._begun", seen)
     own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
-    richer = replace(PREISACH, name="one power more", powers=PREISACH.powers + 1)
-    found = identify(*simulated_run("preisach"), [LINEAR, PREISACH, richer, own])
-    assert found.scores[richer.name] == found.scores[PREISACH.name]
-    assert begun == [PREISACH.name, richer.name]
+    richer = replace(PLAYS, name="one power more", powers=PLAYS.powers + 1)
+    found = identify(*simulated_run("prandtl_ishlinskii"), [LINEAR, PLAYS, richer, own])
+    assert found.scores[richer.name] == found.scores[PLAYS.name]
+    assert begun == [PLAYS.name, richer.name]
 
 
 def test_the_creep_rate_is_found() -> None:
@@ -171,7 +171,7 @@ def test_actuators_that_hardly_turn_are_refused(rising: Run) -> None:
 def test_actuators_that_hardly_move_are_refused(rising: Run) -> None:
     signals = rising.signals.copy()
     signals[:, 2:4] *= 0.05
-    with pytest.raises(ExcitationError, match="actuator 3 turned"):
+    with pytest.raises(ExcitationError, match=r"actuator [34] turned"):
         identify(replace(rising, signals=signals))
 
 

@@ -33,6 +33,7 @@ _PHASES = {
     StepKind.POKE: "pokes",
     StepKind.SURFACE: "surfaces",
     StepKind.EXCITATION: "hysteresis",
+    StepKind.IN_USE: "hysteresis",
     StepKind.CHECK: "hysteresis",
     StepKind.DEGAUSSED: "hysteresis",
 }

@@ -9,7 +9,7 @@ import pytest
 
 from dm_calibration.hysteresis.excitation import REPEATS
 from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
-from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, check_shape, make_plan
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan, shape_in_use
 from dm_common.errors import UnknownNameError
 from linear_mirror import make_mirror
 from steady_mirror import SteadyMirror
@@ -96,7 +96,7 @@ def test_checks_lie_where_the_mirror_is_used() -> None:
     steps = [step for step in plan.steps if step.kind is StepKind.CHECK]
     levels = {}
     for name, model in (("two-sided", fit), ("one-sided", pulled)):
-        shapes = [check_shape(step, model, bench.mirror).signals for step in steps]
+        shapes = [shape_in_use(step, model, bench.mirror).signals for step in steps]
         levels[name] = np.array([shape.mean() for shape in shapes if shape is not None])
         assert all(shape is not None and bench.mirror.limits.allow(shape) for shape in shapes)
     assert np.allclose(
@@ -113,7 +113,7 @@ def test_a_run_that_may_end_early_asks_as_soon_as_a_law_can_be_found(rings: int,
     """60 commands do for a small mirror; 37 actuators need two for each. Later it asks after a quarter more."""
     plan = make_plan(PlanKind.HYSTERESIS, make_mirror(rings=rings), PlanOptions(hysteresis_maps=most, until=2e-9))
     commands = [
-        sum(step.kind in (StepKind.EXCITATION, StepKind.CHECK) for step in plan.steps[:end]) - REPEATS
+        sum(step.in_use or step.kind is StepKind.EXCITATION for step in plan.steps[:end]) - REPEATS
         for end in sorted(plan.ends)
     ]
     assert commands == looks

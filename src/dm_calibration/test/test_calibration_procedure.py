@@ -226,7 +226,8 @@ def test_no_maps_at_all(bench: LinearBench, mirror: Mirror) -> None:
         Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()
 
 
-def test_checks_are_shapes_on_the_flat_surface() -> None:
+@pytest.mark.parametrize(("kind", "count"), [(StepKind.CHECK, 40), (StepKind.IN_USE, 43)])
+def test_shapes_as_in_use_are_on_the_flat_surface(kind: StepKind, count: int) -> None:
     """As in use: the figure is gone, and what is left is the shape of the plan."""
     mirror = make_mirror(neighbour_difference_max=1.0)
     plant = LinearMirror(mirror.x, mirror.y)
@@ -234,8 +235,8 @@ def test_checks_are_shapes_on_the_flat_surface() -> None:
     outcome = run(LinearBench(mirror, plant), mirror, PlanKind.HYSTERESIS).outcome
     steps = make_plan(PlanKind.HYSTERESIS, mirror).steps
     planned = {step.label: step.signals for step in steps if step.signals is not None}
-    checks = [record for record in outcome.records if record.kind == StepKind.CHECK.value]
-    assert len(checks) == 40
+    checks = [record for record in outcome.records if record.kind == kind.value]
+    assert len(checks) == count
     shapes = np.array([plant.influence @ planned[record.label] for record in checks])
     left = np.array([record.coefficients for record in checks]) - plant.fit_terms(shapes)
     size = np.median(np.abs(left[:, 3:]).max(axis=1))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.excitation import CHECK_SHARE, MAPS_MIN, excitation
+from dm_calibration.hysteresis.excitation import CHECK_SHARE, FLAT_KNOWN, MAPS_MIN, excitation, next_part
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from linear_mirror import make_mirror
@@ -46,13 +46,30 @@ def test_held_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> N
     commands = excitation(mirror, 300)
     squares = mirror.x**2 + mirror.y**2
     lean = commands.signals @ (squares - squares.mean())
-    held = (commands.dwell > 0.0) & ~commands.check
+    held = (commands.dwell > 0.0) & ~commands.in_use
     first = np.arange(300) < np.median(np.flatnonzero(held))
     assert (lean[held & first] > 0.0).all()
     assert (lean[held & ~first] < 0.0).mean() > 0.9  # but for the one in the middle
     early = commands.settle_share < 1.0
     assert 0.15 < early[~commands.check].mean() < 0.4
-    assert not (early & (held | commands.check)).any()
+    assert not (early & ((commands.dwell > 0.0) | commands.check)).any()
+
+
+def test_every_other_shape_is_as_in_use_once_random_ones_tell_the_flat() -> None:
+    mirror = make_mirror(rings=1)
+    commands = excitation(mirror, 200)
+    random, checks = FLAT_KNOWN * mirror.actuators, int(commands.check.sum())
+    assert not commands.in_use[:random].any() and commands.in_use[commands.check].all()
+    assert commands.in_use[random:-checks].mean() == pytest.approx(0.5, abs=0.01)
+    assert next_part(mirror, 20, 1).in_use[:-4].mean() == 0.5
+
+
+@pytest.mark.parametrize("difference", [0.5, 1.0, 2.0])
+def test_random_signals_come_nearly_as_often_at_the_ends(difference: float) -> None:
+    """The third of the range that is nearest to an end has a third of them, one in ten less."""
+    commands = excitation(limited(difference), 2000)
+    signals = commands.signals[~commands.in_use & (commands.dwell == 0.0)]
+    assert (np.abs(signals) > 2.0 / 3.0).mean() > 0.3
 
 
 def test_a_seed_is_a_sequence() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.features import crept, follow, play_features
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import BEFORE_FIRST_MAP_S, MapSet
 from dm_common.hysteresis.inverse import certain_reach
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.measurement import Measurement
@@ -52,7 +52,7 @@ def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
         replace(record, label=str(k), stamp_ns=stamp * 10**9, moved_ns=moved * 10**9)
         for k, (stamp, moved) in enumerate(times)
     ]
-    assert MapSet.of(records).moved_s() == pytest.approx([0.0, 1.0, 2.0, 4.0, 6.0])
+    assert MapSet.of(records).moved_s() == pytest.approx([-BEFORE_FIRST_MAP_S, 1.0, 2.0, 4.0, 6.0])
 
 
 def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -> None:

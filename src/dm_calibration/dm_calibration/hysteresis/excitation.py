@@ -1,12 +1,14 @@
 """Commands that show hysteresis and creep of all actuators at once.
 
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
-sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen: near a bowl
-in one half of the run, near its inverse in the other, so that creep over minutes shows too. Maps that are taken early
-show creep of the first second. The last fifth are moves as in use, low-order shapes of random size and order, kept to
-test the law that the others gave. They begin with a degauss, and where there are many another comes halfway. Only what
-follows shows the offset between demagnetised actuators and the mean of their loops; without it the fit puts the offset
-into the figure, and requests after a degauss are off by a constant.
+sag shows N displacements per map, so one run serves all. As soon as these tell about where the mirror is flat, every
+other shape is as in use: of low orders, with random signals of each actuator on top, about the flat mirror. Actuators
+that flatten a figure then stand near an end of their range for long, where random shapes hardly come. Now and then a
+shape is held for creep to be seen: near a bowl in one half of the run, near its inverse in the other, so that creep
+over minutes shows too. Maps that are taken early show creep of the first second. The last fifth are moves as in use
+alone, kept to test the law that the others gave. They begin with a degauss, and where there are many another comes
+halfway. Only what follows shows the offset between demagnetised actuators and the mean of their loops; without it the
+fit puts the offset into the figure, and requests after a degauss are off by a constant.
 """
 
 from dataclasses import dataclass
@@ -30,6 +32,11 @@ SWINGS = (1.0, 1.0, 0.6, 0.3)
 #: Share of the shapes that are held, and for how long, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
+#: So many random shapes for each actuator tell where the mirror is flat; of the shapes after them one in so many is as
+#: in use, with random signals of up to so much, as a share of half the range, on top.
+FLAT_KNOWN, IN_USE_EVERY, SCATTER = 2, 2, 0.3
+#: Random signals on top of the moves that test the law, likewise.
+CHECK_SCATTER = 0.03
 #: How far held shapes are drawn to a bowl.
 BOWL = 0.7
 #: Share of the maps that are taken early, and the share of the settle time after which.
@@ -41,15 +48,17 @@ class Excitation:
     """Commands in order.
 
     Attributes:
-        signals: (M, N) legal shapes, repeats not included.
+        signals: (M, N) legal shapes, repeats not included; of those as in use, what they bend a flat mirror by.
         dwell: (M,) s to hold each beyond the settle time before its map.
         settle_share: (M,) of the settle time to wait.
+        in_use: (M,) which are as in use, those that test the law among them.
         check: (M,) which test the law.
     """
 
     signals: Floats
     dwell: Floats
     settle_share: Floats
+    in_use: NDArray[np.bool_]
     check: NDArray[np.bool_]
 
     @property
@@ -67,30 +76,38 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     """
     if not MAPS_MIN <= maps <= MAPS_MAX:
         raise ValueError(f"hysteresis_maps = {maps}: must be {MAPS_MIN} to {MAPS_MAX}")
-    return next_part(mirror, maps, seed)
+    return _part(mirror, maps, seed, FLAT_KNOWN * mirror.actuators)
 
 
 def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
     """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted."""
+    return _part(mirror, maps, seed, 0)
+
+
+def _part(mirror: Mirror, maps: int, seed: int, random: int) -> Excitation:
+    """`maps` commands, of which `random` ones come before those as in use."""
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
-    shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, rng)))
-    check = np.arange(maps) >= maps - checks
+    shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, CHECK_SCATTER, rng)))
+    number = np.arange(maps)
+    check = number >= maps - checks
+    in_use = check | ((number >= random) & (number % IN_USE_EVERY == 0))
+    shapes[in_use & ~check] = _as_in_use(mirror, int((in_use & ~check).sum()), SCATTER, rng)
     held = rng.random(maps) < HELD_SHARE
-    shapes[held & ~check] = _bowls(mirror, shapes[held & ~check])
+    shapes[held & ~in_use] = _bowls(mirror, shapes[held & ~in_use])
     low, high = np.log(HELD_S)
     dwell = np.where(held, np.exp(rng.uniform(low, high, maps)), 0.0)
     early = ~held & ~check & (rng.random(maps) < EARLY_SHARE)
-    return Excitation(shapes, dwell, np.where(early, EARLY, 1.0), check)
+    return Excitation(shapes, dwell, np.where(early, EARLY, 1.0), in_use, check)
 
 
 def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
-    """(count, N) independent signals; where neighbours must stay near each other, about a common level that moves."""
-    middle, half_range = mirror.limits.middle, mirror.limits.half_range
-    swing = rng.choice(SWINGS, (count, 1))
-    own = swing * min(half_range, 0.5 * mirror.limits.neighbour_difference)
-    level = rng.uniform(-1.0, 1.0, (count, 1)) * np.maximum(swing * half_range - own, 0.0)
-    return np.asarray(middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators)))
+    """(count, N) signals of each actuator about a common level; all signals come nearly as often, up to the ends."""
+    limits = mirror.limits
+    own = rng.choice(SWINGS, (count, 1)) * min(limits.half_range, 0.5 * limits.neighbour_difference)
+    level = rng.uniform(-1.0, 1.0, (count, 1)) * np.minimum(2.0 * (limits.half_range - own), limits.half_range)
+    shapes = limits.middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
+    return np.asarray(np.clip(shapes, limits.low, limits.high))
 
 
 def _gentle(mirror: Mirror, shapes: Floats) -> Floats:
@@ -113,14 +130,14 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
     return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * sign[:, None] * bowl))
 
 
-def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
-    """(count, N) bowls with some astigmatism, coma and scatter about any common level, inside the limits."""
+def _as_in_use(mirror: Mirror, count: int, scatter: float, rng: np.random.Generator) -> Floats:
+    """(count, N) bowls with some astigmatism, coma and `scatter` about any common level, inside the limits."""
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     reach = float(np.hypot(mirror.x, mirror.y).max()) or 1.0
     x, y = mirror.x / reach, mirror.y / reach
     patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
     size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])
-    shapes = size @ patterns + 0.03 * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
+    shapes = size @ patterns + scatter * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
     shapes *= _gentle(mirror, shapes)[:, None]
     shapes = np.clip(shapes, -1.0, 1.0)
     # Of a plate the level is only piston; a membrane that all actuators pull is a sphere.

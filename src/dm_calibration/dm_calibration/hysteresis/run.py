@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.features import EVEN, creep_states, crept, follow, relaxation
 from dm_calibration.hysteresis.responses import Responses, responses_of
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import BEFORE_FIRST_MAP_S, MapSet
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 
-#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
-BEFORE_FIRST_MAP_S = 1.0
 #: A step of the figure is this much more likely than fading creep to explain few maps.
 _FADING_SCALE = 0.1
 

@@ -18,10 +18,14 @@ REFERENCE = "reference"
 POKE = "poke"
 SURFACE = "surface"
 EXCITATION = "excitation"
+#: Of hysteresis too, as in use: about the flat mirror.
+IN_USE = "in_use"
 CHECK = "check"
 #: At rest, after a degauss in the course of a run.
 DEGAUSSED = "degaussed"
-KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, CHECK, DEGAUSSED)
+KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, IN_USE, CHECK, DEGAUSSED)
+#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
+BEFORE_FIRST_MAP_S = 1.0
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 3
 
@@ -100,10 +104,10 @@ class MapSet:
         return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
     def moved_s(self) -> Floats:
-        """(M,) s since the first map: when the mirror took each shape; right after the map before where not known, and
-        after a degauss, while which creep follows the middle of its swings.
+        """(M,) s since the first map: when the mirror took each shape; right after the map before, or the degauss
+        before the first, where not known, and after a degauss, while which creep follows the middle of its swings.
         """
-        before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
+        before = np.concatenate((self.stamp_ns[:1] - round(1e9 * BEFORE_FIRST_MAP_S), self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
         before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before
         plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns) & ~self.degaussed

@@ -20,10 +20,10 @@ HYSTERESIS_REFERENCE_EVERY = 100
 FIRST_PART, NEXT_PART, PART_STEP = 2.0, 0.25, 20
 #: Commands after which it ends in any case, where the goal gives no other number.
 LAST_PART_ENDS = 420
-#: Share of the neighbour limit that checks may use: rounding must not break it.
-CHECK_ROOM = 0.999
+#: Share of the neighbour limit that shapes as in use may take up: rounding must not break it.
+IN_USE_ROOM = 0.999
 #: Share of the range from mid range to an end from which on a mirror that is flat there is one-sided; and by how much
-#: its checks spread further than those about mid range, to reach both ends.
+#: its shapes as in use spread further than those about mid range, to reach both ends.
 ONE_SIDED, LEVELS_WIDER = 0.5, 1.5
 
 
@@ -45,6 +45,7 @@ class StepKind(Enum):
     POKE = "poke"
     SURFACE = "surface"
     EXCITATION = "excitation"
+    IN_USE = "in_use"
     CHECK = "check"
     DEGAUSSED = "degaussed"
 
@@ -55,8 +56,8 @@ class Step:
 
     Attributes:
         label: unique in the plan.
-        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. Of a check,
-            what it bends the mirror by when the figure is flat: see :func:`check_shape`.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. Of one as
+            in use, what it bends the mirror by when the figure is flat: see :func:`shape_in_use`.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
         dwell: to hold the shape beyond the settle time, s.
     """
@@ -76,7 +77,12 @@ class Step:
     @property
     def needs_model(self) -> bool:
         """Whether the signals must be solved from an influence function first."""
-        return self.kind is StepKind.CHECK or (self.kind is StepKind.SURFACE and self.signals is None)
+        return self.in_use or (self.kind is StepKind.SURFACE and self.signals is None)
+
+    @property
+    def in_use(self) -> bool:
+        """Whether it makes a shape as in use, about the flat mirror."""
+        return self.kind in (StepKind.IN_USE, StepKind.CHECK)
 
 
 @dataclass(frozen=True)
@@ -148,13 +154,13 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
         if count:
             ends.add(len(steps))
         degaussed = part.degaussed
-        commands = zip(part.signals, part.dwell, part.settle_share, part.check, strict=True)
-        for row, (signals, dwell, share, check) in enumerate(commands):
+        commands = zip(part.signals, part.dwell, part.settle_share, part.in_use, part.check, strict=True)
+        for row, (signals, dwell, share, in_use, check) in enumerate(commands):
             if row in degaussed:
                 steps.append(Step(f"degauss {count}", StepKind.DEGAUSS))
                 steps.append(Step(f"degaussed {count}", StepKind.DEGAUSSED, mirror.rest))
             count += 1
-            kind = StepKind.CHECK if check else StepKind.EXCITATION
+            kind = StepKind.CHECK if check else StepKind.IN_USE if in_use else StepKind.EXCITATION
             steps.append(Step(f"{kind.value} {count}", kind, signals, dwell=float(dwell), settle_share=float(share)))
             if count % HYSTERESIS_REFERENCE_EVERY == 0:
                 number = 1 + count // HYSTERESIS_REFERENCE_EVERY
@@ -175,22 +181,22 @@ def _parts(options: PlanOptions, actuators: int) -> list[int]:
     return np.diff([0, *ends, most]).tolist()
 
 
-def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
+def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
     """`step` with the signals that make its shape on a flat surface, as every request in use does.
 
-    The law is tested, and fitted, where it will be used: about the signals that flatten the mirror. Where that is an
+    The law is fitted, and tested, where it will be used: about the signals that flatten the mirror. Where that is an
     end of its range, as of a membrane that is only pulled, at levels all over the range.
     """
     assert step.signals is not None
     limits = mirror.limits
-    inside = replace(limits, neighbour_difference=CHECK_ROOM * limits.neighbour_difference)
+    inside = replace(limits, neighbour_difference=IN_USE_ROOM * limits.neighbour_difference)
     flat = surfaces.solve_shape(np.zeros_like(model.sag_offset), model, mirror, inside)[0]
     room = 0.5 * (limits.high - limits.low)
     if abs((flat - mirror.rest).mean()) > ONE_SIDED * room:
         away = step.signals - mirror.rest
-        level = float(np.clip(LEVELS_WIDER * away.mean(), -CHECK_ROOM * room, CHECK_ROOM * room))
+        level = float(np.clip(LEVELS_WIDER * away.mean(), -IN_USE_ROOM * room, IN_USE_ROOM * room))
         pattern = away - away.mean()
-        share = (CHECK_ROOM * room - abs(level)) / max(float(np.abs(pattern).max()), 1e-12)
+        share = (IN_USE_ROOM * room - abs(level)) / max(float(np.abs(pattern).max()), 1e-12)
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)
     target = model.influence_sag @ (step.signals - mirror.rest)
     return replace(step, signals=limits.scaled(surfaces.solve_shape(target, model, mirror, inside)[0])[0])

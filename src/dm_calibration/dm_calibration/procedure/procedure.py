@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.influence.maps import CHECK, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
 from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
-from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, check_shape
+from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, shape_in_use
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench
@@ -61,7 +61,8 @@ class Procedure:
         """Prepare a run.
 
         Args:
-            model: solves the surfaces with a prescribed shape; None = one fitted to the maps of this run so far.
+            model: solves the surfaces with a prescribed shape; None = one fitted to the maps of this run before the
+                first of their kind.
             outcome: of a run of the same plan that was cut off; None = begin.
             keep: called with each event before it counts; what it raises ends the run.
             guard: asked before each step; what it raises ends the run.
@@ -71,6 +72,7 @@ class Procedure:
         self._plan, self._mirror, self._bench = plan, mirror, bench
         self._options = options or ProcedureOptions()
         self._model = model
+        self._models: dict[StepKind, LinearModel] = {}
         self._progress, self._keep = progress, keep
         self._cancelled, self._guard = cancelled, guard
         self._failures = 0
@@ -151,13 +153,15 @@ class Procedure:
         if not step.needs_model:
             return step
         try:
-            if self._model is None:
-                self._model = fit_influence(self._maps_before_solving(), self._options.fit, rings=self._mirror.rings)
-            if step.kind is StepKind.CHECK:
-                return check_shape(step, self._model, self._mirror)
-            surface = model_surface(step.label, self._model, self._mirror)
+            model = self._model or self._models.get(step.kind)
+            if model is None:
+                maps = self._maps_before_solving(step.kind)
+                model = self._models[step.kind] = fit_influence(maps, self._options.fit, rings=self._mirror.rings)
+            if step.in_use:
+                return shape_in_use(step, model, self._mirror)
+            surface = model_surface(step.label, model, self._mirror)
         except TooFewMapsError as error:
-            if step.kind is StepKind.CHECK:
+            if step.in_use:
                 return step
             reason = f"{step.label}: no influence function to solve its signals from: {error}"
             self._note(Dropped(number, reason, whole=True))
@@ -165,10 +169,12 @@ class Procedure:
         self._note(Solved(surface.target, surface.remark))
         return replace(step, signals=surface.signals, nominal=surface.nominal)
 
-    def _maps_before_solving(self) -> MapSet:
-        """The maps before the first solved shape: the same whether the run was interrupted after it or not."""
+    def _maps_before_solving(self, kind: StepKind) -> MapSet:
+        """The maps before the first solved shape of a kind, the same whether the run was interrupted or not."""
         maps = self.outcome.maps()
-        solved = np.isfinite(maps.nominal).any(axis=1) | np.array([kind == CHECK for kind in maps.kind])
+        solved = np.array([one == kind.value for one in maps.kind])
+        if kind is StepKind.SURFACE:
+            solved &= np.isfinite(maps.nominal).any(axis=1)
         return maps.select(~np.logical_or.accumulate(solved))
 
     def _measure_state(self, step: Step, number: int, repeats: int) -> None:
@@ -198,7 +204,7 @@ class Procedure:
         Its time is not known; it counts as right after the map before.
         """
         records = self.outcome.records
-        if step.kind not in (StepKind.EXCITATION, StepKind.CHECK, StepKind.DEGAUSSED) or not records:
+        if not (step.in_use or step.kind in (StepKind.EXCITATION, StepKind.DEGAUSSED)) or not records:
             return
         nothing = np.full_like(records[-1].coefficients, np.nan)
         assert step.signals is not None

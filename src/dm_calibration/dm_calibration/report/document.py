@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 #: Colours that stay apart for colour-blind readers [28].
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
-SKY_BLUE = "#56B4E9"
+SKY_BLUE, YELLOW = "#56B4E9", "#F0E442"
 #: For sag about zero: dark at both ends, light in the middle, safe for colour-blind readers.
 DIVERGING = "RdBu_r"
 #: Of pictures; on paper, where they are smaller than on a screen, some 200.

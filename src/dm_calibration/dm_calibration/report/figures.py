@@ -12,7 +12,7 @@ from scipy.interpolate import RBFInterpolator
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import KINDS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
-from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION
+from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, YELLOW
 from dm_calibration.report.residuals import Residuals
 from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
@@ -24,7 +24,7 @@ NM, MM = 1e9, 1e3
 PIXELS = 61
 #: Small maps in a row.
 COLUMNS = 7
-KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, PURPLE, SKY_BLUE), strict=True))
+KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, SKY_BLUE, PURPLE, YELLOW), strict=True))
 
 
 def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:
