@@ -23,7 +23,7 @@ from dm_msgs.srv import IngestFile, Measure
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults import bench_faults
 from fault_injection.rigs.common_steps import checked
-from fault_injection.rigs.driver_rig import ACTUATORS
+from fault_injection.rigs.driver_rig import ACTUATORS, RigError
 from fault_injection.rigs.process_rig import CURVATURE, ProcessRig, calibrated_rig
 
 #: Longest time for which a node is stopped, s.
@@ -32,6 +32,8 @@ STOPPED_S = 2.0
 RUN_S = 300.0
 #: Requests that wait while the interferometer reads; a service keeps ten.
 FILES = 8
+#: Requests at most until one that conditions the mirror is carried out, 0.1 s after each other.
+TRIES = 50
 #: Focus requests per second of a stream.
 STREAM_HZ = 100.0
 
@@ -117,6 +119,11 @@ def focus_controller_in_move(rig: ProcessRig, random: Random) -> Activity:
     return Activity([answer])
 
 
+def _moved_or_ended(rig: ProcessRig, frames: int, answer: Any) -> Callable[[], bool]:
+    """Whether so many frames have arrived, or a goal has ended before."""
+    return lambda: rig.frames >= frames or bool(answer.done())
+
+
 @_state("focus_controller", "in a move that conditions the mirror first")
 def focus_controller_conditioning(rig: ProcessRig, random: Random) -> Activity:
     # A lost link makes the history unknown, so that conditioning is worth its time.
@@ -125,9 +132,15 @@ def focus_controller_conditioning(rig: ProcessRig, random: Random) -> Activity:
     rig.bench.electronics.set_plugged(True)
     rig.wait_for_driver_state(ActuatorState.STATE_ACTIVE)
     request = FocusRequest(curvature=random.uniform(-CURVATURE, CURVATURE), time_budget=120.0)
-    answer = rig.goal(MoveFocus, MoveFocus.Goal(request=request))
-    rig.wait_moving(random.randint(1, 60))
-    return Activity([answer])
+    moved = rig.frames + random.randint(1, 60)
+    # The controller may hear that the link is up a moment after the rig does, and refuses until then.
+    for _ in range(TRIES):
+        answer = rig.goal(MoveFocus, MoveFocus.Goal(request=request))
+        rig.wait(_moved_or_ended(rig, moved, answer), "a move under way")
+        if rig.frames >= moved:
+            return Activity([answer])
+        time.sleep(0.1)
+    raise RigError(f"not conditioned: {answer.result().result.message}")
 
 
 @_state("focus_controller", f"with a stream of requests at {STREAM_HZ:g} Hz, which goes on meanwhile")

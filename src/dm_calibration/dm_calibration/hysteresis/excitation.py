@@ -29,6 +29,9 @@ REPEATS = 8
 MAPS_MIN, MAPS_MAX = 60, 2000
 #: Swings as a share of the range: with fewer full ones errors in use are larger (studies/comparison/NOTES.md).
 SWINGS = (1.0, 1.0, 0.6, 0.3)
+#: Runs of so many maps have random signals up to the ends of the range, by levels that all actuators share. No map
+#: shows a level, so shorter runs have less of it: after 100 to 200 maps errors are up to three times smaller so.
+WIDE_LEVELS_FROM = 250
 #: Share of the shapes that are held, and for how long, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
@@ -76,19 +79,19 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     """
     if not MAPS_MIN <= maps <= MAPS_MAX:
         raise ValueError(f"hysteresis_maps = {maps}: must be {MAPS_MIN} to {MAPS_MAX}")
-    return _part(mirror, maps, seed, FLAT_KNOWN * mirror.actuators)
+    return _part(mirror, maps, seed, FLAT_KNOWN * mirror.actuators, wide=maps >= WIDE_LEVELS_FROM)
 
 
 def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
     """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted."""
-    return _part(mirror, maps, seed, 0)
+    return _part(mirror, maps, seed, 0, wide=False)
 
 
-def _part(mirror: Mirror, maps: int, seed: int, random: int) -> Excitation:
-    """`maps` commands, of which `random` ones come before those as in use."""
+def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> Excitation:
+    """`maps` commands, of which `random` ones come before those as in use; levels are `wide` or not."""
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
-    shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, CHECK_SCATTER, rng)))
+    shapes = np.vstack((_random(mirror, maps - checks, wide, rng), _as_in_use(mirror, checks, CHECK_SCATTER, rng)))
     number = np.arange(maps)
     check = number >= maps - checks
     in_use = check | ((number >= random) & (number % IN_USE_EVERY == 0))
@@ -101,11 +104,13 @@ def _part(mirror: Mirror, maps: int, seed: int, random: int) -> Excitation:
     return Excitation(shapes, dwell, np.where(early, EARLY, 1.0), in_use, check)
 
 
-def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
-    """(count, N) signals of each actuator about a common level; all signals come nearly as often, up to the ends."""
-    limits = mirror.limits
-    own = rng.choice(SWINGS, (count, 1)) * min(limits.half_range, 0.5 * limits.neighbour_difference)
-    level = rng.uniform(-1.0, 1.0, (count, 1)) * np.minimum(2.0 * (limits.half_range - own), limits.half_range)
+def _random(mirror: Mirror, count: int, wide: bool, rng: np.random.Generator) -> Floats:
+    """(count, N) signals of each actuator about a common level; where `wide`, all signals come nearly as often."""
+    limits, half_range = mirror.limits, mirror.limits.half_range
+    swing = rng.choice(SWINGS, (count, 1))
+    own = swing * min(half_range, 0.5 * limits.neighbour_difference)
+    reach = np.minimum(2.0 * (half_range - own), half_range) if wide else np.maximum(swing * half_range - own, 0.0)
+    level = reach * rng.uniform(-1.0, 1.0, (count, 1))
     shapes = limits.middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
     return np.asarray(np.clip(shapes, limits.low, limits.high))
 
