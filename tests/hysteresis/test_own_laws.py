@@ -99,7 +99,7 @@ def test_actuators_that_are_alike_lose_nothing() -> None:
 
 
 def test_maps_too_few_to_tell_the_loops_apart_are_said_to_be() -> None:
-    run, check = relay_run(0.0, 14, 60)
+    run, check = relay_run(0.0, 12, 60)
     found = identify(run, check, LAWS)
     assert not found.fit.candidate.own and says_alike(found)
 
