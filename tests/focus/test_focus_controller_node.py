@@ -161,6 +161,14 @@ def test_move_focus_refuses_a_tolerance_it_cannot_keep(bench: Bench) -> None:
     assert bench.commands == []
 
 
+def test_a_refused_goal_says_so_in_its_state_too(bench: Bench) -> None:
+    bench.ready()
+    goal = MoveFocus.Goal(request=FocusRequest(curvature=0.02), settle_time=-1.0)
+    result = bench.observer.run_goal(MoveFocus, "move_focus", goal).result
+    assert result.error_code == result.state.error_code == ErrorCode.OUT_OF_RANGE
+    assert result.message == result.state.message and "settle_time = -1" in result.message
+
+
 def test_cancel_holds_the_shape_reached_and_the_newest_goal_preempts(bench: Bench) -> None:
     bench.follow = False  # the driver never gets there: the move lasts until it is told to stop
     bench.ready()

@@ -37,6 +37,14 @@ def taken(source: Any, *names: str) -> dict[str, Any]:
     return {name: getattr(source, name) for name in names}
 
 
+def answer_with(answer: Any, code: int, text: str) -> None:
+    """Put code and sentence into an answer, and into the FocusState within, as far as it has a place for them."""
+    each: Any
+    for each in (answer, getattr(answer, "state", None)):
+        if hasattr(each, "error_code"):
+            each.error_code, each.message = code, text
+
+
 def time_message(stamp_ns: int) -> Time:
     """ns since the epoch of the clock as a message."""
     return Time(sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))

@@ -1,8 +1,7 @@
 """Work that waits, beside an executor that never does.
 
-A service or action callback that would block (settling, files, fits, other services) runs as ordinary code in a worker
-thread; its outcome is handed back to the executor, which sends the response. While it runs, streams are served
-undisturbed and nothing polls.
+A callback that would block (settling, files, fits, other services) runs in a worker thread; its outcome is handed back
+to the executor, which sends the response. Streams are served undisturbed meanwhile and nothing polls.
 """
 
 import threading
@@ -20,6 +19,7 @@ from rclpy.node import Node
 from rclpy.service import Service
 
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.messages import answer_with
 from dm_common.ros import qos
 from dm_common.ros.executor import PatientActionServer, until_discovered
 from dm_common.values import Fields, without_figures
@@ -40,12 +40,10 @@ def _check_active(node: Node) -> None:
 
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
-    """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL where the answer has a place for that."""
+    """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL."""
     if node.context.ok():  # else the process is ending: what a worker still used is gone, and so is who asked
         node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
-    if hasattr(answer, "error_code"):
-        answer.error_code = ErrorCode.INTERNAL
-        answer.message = f"{type(error).__name__}: {error}"
+    answer_with(answer, ErrorCode.INTERNAL, f"{type(error).__name__}: {error}")
 
 
 def never_silent(
@@ -70,7 +68,7 @@ def never_silent(
             if response == type(response)():  # else the callback knows already what it has filled in
                 without_figures(response)
             refused = str(error)
-            response.error_code, response.message = error_code(error), refused
+            answer_with(response, error_code(error), refused)
             if refused != before:
                 node.get_logger().warning(f"{name}: {refused}")
         except Exception as error:
@@ -226,7 +224,7 @@ class WorkerActionServer(PatientActionServer):
             self._admit(goal_handle.request)
         except Refusal as refusal:
             result = without_figures(self._action_type.Result())
-            result.error_code, result.message = refusal.error_code, str(refusal)
+            answer_with(result, refusal.error_code, str(refusal))
             self._finish(goal_handle, "abort", result)
             return
         goal = WorkerGoal(goal_handle, self._worker_node)
