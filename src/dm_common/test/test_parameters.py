@@ -111,13 +111,20 @@ def test_every_parameter_has_a_value_empty_lists_too(observer: Observer) -> None
 
 def test_a_whole_number_counts_as_a_float_and_an_empty_list_is_one(observer: Observer) -> None:
     node = node_with(observer, "converted", serial="S1", gain=3, positions=[0, 1])
-    values = declare(node, TABLE)
+    values = declare(node, [*TABLE, Parameter("levels", reals([], -1.0, 1.0), "how far", live=True)])
     assert (values["gain"], values["positions"]) == (3.0, [0.0, 1.0])
     assert get_all(node)["gain"] == 3.0
     assert node.set_parameters([RosParameter("gain", value=7)])[0].successful
     with pytest.raises(ParameterNotDeclaredException, match="gain = 'much': must be"):  # so the service says it
         node.set_parameters([RosParameter("gain", value="much")])
     assert isinstance(values["gain"], float) and values["gain"] == 7.0
+    # What `ros2 param load` makes of 3e-01, [0.5, 3e-01] and [3e-01, 4e-01].
+    texts: dict[str, Any] = {"3e-01": ("gain", 0.3), "[0.5, 3e-01]": ("levels", [0.5, 0.3])}
+    for given, (name, number) in texts.items():
+        assert node.set_parameters([RosParameter(name, value=given)])[0].successful
+        assert values[name] == number
+    assert node.set_parameters([RosParameter("levels", value=["3e-01", "4e-01"])])[0].successful
+    assert values["levels"] == [0.3, 0.4]
     node.destroy_node()
     empty = Node(
         "empty", parameter_overrides=[RosParameter("serial", value="S1"), RosParameter("positions", value=None)]

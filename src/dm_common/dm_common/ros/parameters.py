@@ -8,6 +8,7 @@ import difflib
 import math
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -258,11 +259,22 @@ def frame_id(node: Node, configured: str) -> str:
 def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
     empty = parameter.value.many and change.type_ != RosParameter.Type.NOT_SET and not change.value
     try:
-        return parameter.as_ros(parameter.check([] if empty else change.value))
+        return parameter.as_ros(parameter.check([] if empty else _numbers(parameter.value, change.value)))
     except ParameterError as error:
         if change.type_ == _TYPES[parameter.value.kind]:
             return change
         raise _RefusedParameterError(str(error)) from error  # what rclpy says of another type names no parameter
+
+
+def _numbers(value: Value, given: Any) -> Any:
+    """`given`, where YAML took floats for a text: it does so with 3e-08, and `ros2 param` with it."""
+    texts = given.strip("[]").split(",") if value.many and isinstance(given, str) else given
+    with suppress(ValueError):
+        if value.item is float and isinstance(texts, str):
+            return float(texts)
+        if value.item is float and value.many and texts and all(isinstance(text, str) for text in texts):
+            return [float(text) for text in texts]
+    return given
 
 
 def _judge_unknown(node: Node, name: str, known: Mapping[str, Parameter], values: Values) -> None:
