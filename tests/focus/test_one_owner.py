@@ -257,6 +257,16 @@ def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:
     assert any("pdm_driver was killed by signal 9" in text for text in bench.said)
 
 
+def test_without_its_calibration_node_the_mirror_is_used_on_and_says_so(bench: Bench) -> None:
+    bench.paused = True
+    bench.kill("calibration")
+    died = "the node calibration has died"
+    assert bench.client.wait(lambda: died in bench.health.get("focus_controller", ""), ALLOWED_S)
+    assert bench.focus().state.applied
+    bench.paused = False
+    assert bench.client.wait(lambda: died not in bench.health["focus_controller"], 60.0)
+
+
 def test_an_unplugged_unit_is_known(bench: Bench) -> None:
     power = bench.client.node.create_client(SetBool, "virtual_bench/power")
     bench.client.clients["power"] = power

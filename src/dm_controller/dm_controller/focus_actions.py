@@ -11,11 +11,12 @@ from copy import copy
 from typing import Any
 
 from dm_msgs.action import Degauss, MoveFocus
-from dm_msgs.msg import FocusRequest, FocusState
+from dm_msgs.msg import Calibration, FocusRequest, FocusState
 from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
@@ -51,6 +52,7 @@ class FocusHost(ManagedNode, ABC):
         WorkerService(self, SetFocus, "set_focus", self._on_set_focus)
         WorkerService(self, Flatten, "flatten", self._on_flatten)
         MoveFocusAction(self, self._values)
+        self.calibration_node = qos.watch(self, "calibration", Calibration, "calibration", qos.LATCHED)
 
     @abstractmethod
     def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
@@ -79,8 +81,9 @@ class FocusHost(ManagedNode, ABC):
         self.deactivate()
 
     def health(self) -> Health:
+        calibration = self.calibration_node
         with self.controller() as (controller, now):
-            return health(controller, self._values, now)
+            return health(controller, self._values, now, calibration.text if calibration.missing() else "")
 
     def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
         with self.controller() as (controller, now):

@@ -97,8 +97,8 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
     return "; ".join(filter(None, (nowhere(controller.active, values["reachable_tolerance"]), remark)))
 
 
-def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> Health:
-    """The health of the node whose parameters are `values`.
+def health(controller: FocusController, values: Mapping[str, Any], now: Moment, missing: str = "") -> Health:
+    """The health of the node whose parameters are `values`, and what is `missing` beside it, as a sentence.
 
     While the shape stands that was asked for: its curvature (1/m), for how long (s), the 95 % bound on its error (m).
     """
@@ -123,7 +123,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
                 "age": f"{now.time - order.began.time:.1f}",
                 "bound": plan.max_zernike + error,
             }
-    text = trouble(controller, values, now)
+    text = "; ".join(filter(None, (trouble(controller, values, now), missing)))
     return Health(WARN if text else OK, text or "ready", figures)
 
 

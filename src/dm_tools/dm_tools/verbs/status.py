@@ -44,7 +44,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
         "calibration": _calibration(heard),
-        "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
+        "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),
         "next": _next(lacking, by, state, calibration, shape, capabilities),
@@ -58,7 +58,9 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "curvature": shape.curvature if shape else None,
         "bound_nm": nanometres(shape.bound) if shape else None,
         "calibration": calibration.id if calibration is not None else None,
-        "error_bound_nm": nanometres(capabilities.error_bound) if calibration and capabilities else None,
+        "error_bound_nm": nanometres(capabilities.error_bound)
+        if capabilities and not capabilities.error_code
+        else None,
     }
     write_json(json, {"status": figures})
 
