@@ -141,7 +141,7 @@ def test_update_by_service_is_stored_published_and_forgotten(suite: Suite, begin
     assert suite.call(forget=True).revision == 0
     suite.expect(0)
     assert np.array_equal(stored.fit.influence_sag.ravel(), np.array(suite.calibration.influence_sag))
-    assert sorted(path.name for path in suite.folder.iterdir()) == ["steady.checks.csv", "steady.h5"]
+    assert sorted(path.name for path in suite.folder.iterdir()) == ["in_use_T-1.txt", "steady.checks.csv", "steady.h5"]
 
 
 def test_updates_outlive_the_node(suite: Suite, begin: Callable[..., Suite]) -> None:

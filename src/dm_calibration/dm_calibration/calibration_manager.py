@@ -10,7 +10,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
 from dm_calibration.store.calibration_store import CalibrationStore, raw_hash
 from dm_common.atomic_write import StoreError
-from dm_common.errors import ErrorCode, Refusal, UnknownNameError
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, UnknownNameError
 from dm_common.figures import in_nanometres
 from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError
@@ -88,19 +88,26 @@ class CalibrationManager:
     def use(self, calibration: Calibration | None) -> str:
         """Use `calibration`, which is in the store, from now on. Raises Refusal where the node rests by now.
 
-        Returns a warning where it promises clearly less than the one it replaces; "" = it does not.
+        Returns a warning where it promises clearly less than the one it replaces, or where the next start will not know
+        of it; "" = neither.
         """
         with self._lock:
             before = self.in_use
             if calibration is not None and (reason := self._resting()):
                 raise Refusal(ErrorCode.NODE_INACTIVE, f"{calibration.id} is stored, but not used: {reason}")
             self._put(calibration)
-        if calibration is not None and before is not None and calibration.promise > CLEARLY_WORSE * before.promise:
-            return (
-                f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
-                f"{in_nanometres(before.promise)} (load_calibration brings that back)"
-            )
-        return ""
+        warnings = []
+        if calibration is not None:
+            try:
+                self.store.note_in_use(calibration)
+            except StoreError as error:
+                warnings.append(f"warning: {error}")
+            if before is not None and calibration.promise > CLEARLY_WORSE * before.promise:
+                warnings.append(
+                    f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
+                    f"{in_nanometres(before.promise)} (load_calibration brings that back)"
+                )
+        return "; ".join(warnings)
 
     def _put(self, calibration: Calibration | None) -> None:
         """Take `calibration` in use; the lock must be held."""
@@ -139,6 +146,22 @@ class CalibrationManager:
             calibration = newest
         self.use(calibration)
         return calibration
+
+    def load_last(self) -> tuple[Calibration, str]:
+        """Use the calibration that the mirror used last, or the newest that fits where that is not known.
+
+        Returns it, and why it is not the one used last, as a sentence; "" = it is, or none is known.
+
+        Raises:
+            Refusal: no mirror, the node rests, or no calibration fits.
+        """
+        last, reason = self.store.last_in_use(self.known_mirror().serial), ""
+        if last and not self._resting():
+            try:
+                return self.load(last), ""
+            except EXPECTED as error:
+                reason = f"in use last was {last}: {error}"
+        return self.load(""), reason
 
     def _checked_in_use(self, calibration_id: str) -> Calibration:
         calibration = self.in_use

@@ -158,10 +158,13 @@ class CalibrationNode(ManagedNode):
     def _load_on_start(self) -> None:
         name = self._values["load_on_start"]
         try:
-            calibration = self._manager.load("" if name == "newest" else name)
-            self.get_logger().info(f"calibration {calibration.id} loaded at start")
+            if name == "last":
+                calibration, reason = self._manager.load_last()
+            else:
+                calibration, reason = self._manager.load("" if name == "newest" else name), ""
+            self._log_report(f"calibration {calibration.id} loaded at start{reason and '; '}{reason}", bool(reason))
         except EXPECTED as error:
-            if name == "newest" and error_code(error) == ErrorCode.NOT_CALIBRATED:  # a bench that is new
+            if name in ("last", "newest") and error_code(error) == ErrorCode.NOT_CALIBRATED:  # a bench that is new
                 self.get_logger().info(f"{error}: calibrate first")
             else:
                 self.get_logger().warning(f"load_on_start = {name!r}: {error}")

@@ -20,7 +20,8 @@ PARAMETERS = (
     Parameter(
         "load_on_start",
         text(""),
-        "Calibration to use as soon as the mirror is known: empty = none, newest = the newest that fits, or an id.",
+        "Calibration to use as soon as the mirror is known: empty = none, last = the one in use last (the newest that "
+        "fits where none was), newest = the newest that fits, or an id.",
     ),
     live(
         "write_report",

@@ -71,6 +71,30 @@ def raw_data(file: Path) -> dict[str, bytes]:
     return {name: value.tobytes() if value.dtype != object else b"|".join(value) for name, value in found.items()}
 
 
+def test_the_next_start_uses_what_was_in_use_last(stand: Stand, calibration: Calibration) -> None:
+    """Not one that was stored later without being used; the newest where the last is gone, which is said."""
+    newer = stand.store.save(replace(calibration, id="newer", created_ns=calibration.created_ns + 1))
+    used, reason = stand.manager.load_last()
+    assert (used.id, reason) == ("known", "")
+    stand.file.unlink()
+    used, reason = stand.manager.load_last()
+    assert used.id == "newer" == stand.store.last_in_use(calibration.mirror_serial)
+    assert reason.startswith("in use last was known: calibration 'known': no such file")
+    for content in (b"newer\n", b"~nobody", b"../newer", b"\xff"):
+        (stand.store.folder / "in_use_T-1.txt").write_bytes(content)
+        assert stand.manager.load_last()[0].id == "newer"
+    newer.unlink()
+    with pytest.raises(Refusal, match="no calibration in"):
+        stand.manager.load_last()
+
+
+def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calibration) -> None:
+    (stand.store.folder / "in_use_T-1.txt").unlink()
+    (stand.store.folder / "in_use_T-1.txt").mkdir()
+    assert "warning: known is in use, but the next start will not know: " in stand.manager.use(calibration)
+    assert stand.published[-1] is calibration
+
+
 def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
     before = raw_data(stand.file)
     stand.manager.add_recipes("known", book(-0.01, 0.02))
@@ -79,7 +103,7 @@ def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
     assert [(r.curvature, r.maps) for r in loaded.recipes.recipes] == [(-0.01, 20), (0.0, 33), (0.02, 33)]
     assert len(before) > 10
     assert raw_data(stand.file) == before
-    assert list(stand.file.parent.iterdir()) == [stand.file]
+    assert sorted(file.name for file in stand.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
     assert stand.published[-1] is stand.manager.in_use
     assert stand.published[-1] is not None
     assert len(stand.published[-1].recipes.recipes) == 3
@@ -119,7 +143,7 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
     monkeypatch.undo()
     assert error_code(caught.value) == ErrorCode.STORAGE_FAILED
     assert stand.file.read_bytes() == before
-    assert list(stand.file.parent.iterdir()) == [stand.file]
+    assert sorted(file.name for file in stand.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
     assert stand.manager.in_use is not None
     assert stand.manager.in_use.recipes is NO_RECIPES
     assert len(stand.published) == published

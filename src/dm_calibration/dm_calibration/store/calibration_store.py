@@ -30,9 +30,14 @@ class Entry:
 
 def new_id(mirror_name: str, serial: str, created_ns: int) -> str:
     """An id of mirror, serial number and time (UTC)."""
-    parts = [re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-")[:32] for part in (mirror_name, serial)]
+    parts = [_stem(part) for part in (mirror_name, serial)]
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
     return "_".join([part for part in parts if part] + [stamp])
+
+
+def _stem(text: str) -> str:
+    """What of `text` may stand in a file name."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-")[:32]
 
 
 class CalibrationStore:
@@ -88,6 +93,23 @@ class CalibrationStore:
         with storing(f"calibration {calibration.id} was not stored in {self.folder}"):
             write_whole(target, image)
         self._written(target)
+
+    def note_in_use(self, calibration: Calibration) -> None:
+        """Keep on disk that its mirror uses this one, for the next start. Raises StoreError."""
+        if self.last_in_use(calibration.mirror_serial) != calibration.id:
+            with storing(f"{calibration.id} is in use, but the next start will not know"):
+                write_whole(self._in_use(calibration.mirror_serial), calibration.id.encode())
+
+    def last_in_use(self, serial: str) -> str:
+        """The id of the calibration that a mirror used last; "" = not known."""
+        try:
+            noted = self._in_use(serial).read_text().strip()
+        except (OSError, UnicodeDecodeError):
+            return ""
+        return noted if _ID.fullmatch(noted) else ""
+
+    def _in_use(self, serial: str) -> Path:
+        return self.folder / f"in_use_{_stem(serial)}.txt"
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.

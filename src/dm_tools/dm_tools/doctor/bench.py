@@ -202,8 +202,9 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
     from dm_calibration.recalibration.check_log import SUFFIX, read_checks
     from dm_calibration.store.calibration_store import CalibrationStore
 
-    entries = CalibrationStore(folder).entries()
-    own = [entry.calibration for entry in entries if entry.calibration and entry.calibration.mirror_serial == serial]
+    store = CalibrationStore(folder)
+    entries = store.entries()
+    own = [found for entry in entries if (found := entry.calibration) and found.mirror_serial == serial]
     damaged = [entry for entry in entries if entry.calibration is None]
     if damaged:
         return Finding(damaged[0].remark, f"move it out of {folder}; restore it from your backup if you need it")
@@ -213,14 +214,14 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
         return Finding(
             f"no calibration of the mirror {serial} in {folder}{seen}", "./dm calibrate, once the nodes run", note=True
         )
-    newest = own[0]
-    assert newest is not None
-    agreed = [check.time for check in read_checks(folder / f"{newest.id}{SUFFIX}") if check.accepted]
-    checked = max([newest.created_ns * 1e-9, *agreed])
+    last = store.last_in_use(serial)
+    used = next((one for one in own if one.id == last), own[0])
+    agreed = [check.time for check in read_checks(folder / f"{used.id}{SUFFIX}") if check.accepted]
+    checked = max([used.created_ns * 1e-9, *agreed])
     days = (time.time() - checked) / DAY_S
     if days * DAY_S > stale_after:
         return Finding(
-            f"no map has agreed with {newest.id} for {days:.0f} days",
+            f"no map has agreed with {used.id} for {days:.0f} days",
             "./dm check says whether it is still true, and mends small drifts; else ./dm calibrate",
             note=True,
         )
