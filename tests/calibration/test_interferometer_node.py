@@ -177,7 +177,11 @@ def test_bad_files_get_their_code_and_words_and_the_node_goes_on(
     assert bench.ingest(tmp_path / "good.dat").error_code == ErrorCode.OK
     bench.wait_for_maps(1)
     assert len(bench.zernikes) == 1
-    counted = {("maps_taken", "1"), ("files_refused", "10")}
+    assert bench.ingest(tmp_path / "good.dat").error_code == ErrorCode.OK, "again: it counts once"
+    (tmp_path / "other.dat").write_bytes(dat_bytes(disc_counts(50), pitch=PITCH))
+    assert bench.ingest(tmp_path / "other.dat").error_code == ErrorCode.OK
+    bench.wait_for_maps(3)
+    counted = {("maps_taken", "2"), ("files_refused", "10")}
     health = wait_until(lambda: [array for array in bench.health if counted <= pairs(array)], what="the counts")
     assert (health[0].status[0].name, health[0].status[0].level) == ("interferometer", b"\0")
 

@@ -56,6 +56,7 @@ class InterferometerNode(ManagedNode):
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
+        self._last_taken: Measurement | None = None
         self._warned_of_pitch = False
         self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
         # There in every state: by its lease others know that this node lives.
@@ -209,8 +210,8 @@ class InterferometerNode(ManagedNode):
                 self._map_publisher.publish(messages.image_message(surface, header))
 
     def _log_taken(self, surface: SurfaceMap, measured: Measurement, what: str) -> None:
-        self._taken += 1
-        self._last_file, self._last_refusal = surface.file, ""
+        self._taken += self._last_taken is None or not measured.same_map(self._last_taken)
+        self._last_taken, self._last_file, self._last_refusal = measured, surface.file, ""
         shown = f"PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
         self.get_logger().info(f"{what}: {surface.file or surface.instrument}: {shown}{_mended(surface)}")
         if surface.pitch is None and not self._warned_of_pitch:

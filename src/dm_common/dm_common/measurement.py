@@ -80,12 +80,12 @@ class Measurement:
     temperature: float = float("nan")
 
     def same_map(self, other: Measurement) -> bool:
-        """Whether both are of one map: of one stamp, or one file under another stamp.
+        """Whether both are of one map: of one stamp that is known, or one file under another stamp.
 
         A file that was measured may be ingested again, with the time in its header; no two maps share their
         coefficients to the last bit.
         """
-        return self.stamp_ns == other.stamp_ns or bool(np.array_equal(self.coefficients, other.coefficients))
+        return self.stamp_ns == other.stamp_ns != 0 or bool(np.array_equal(self.coefficients, other.coefficients))
 
 
 class Bench(Protocol):
