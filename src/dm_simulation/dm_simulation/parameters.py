@@ -75,7 +75,6 @@ def check_bench(values: Mapping[str, Any]) -> None:
 
 def bench_config(values: Mapping[str, Any]) -> BenchConfig:
     """The configuration for the values of all parameters of PARAMETERS."""
-
     membrane = values["mirror.principle"] == _ELECTROSTATIC_MEMBRANE
     return BenchConfig(
         seed=values["seed"],

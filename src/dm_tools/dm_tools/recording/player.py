@@ -102,7 +102,6 @@ def _has_changed(node: Node, topic: Topic) -> bool:
 
 def _offer(topic: Topic) -> QoSProfile:
     """The quality of service that the recorded publishers had in common."""
-
     loose = {profile.reliability.name for profile in topic.qos} == {"BEST_EFFORT"}
     latched = {profile.durability.name for profile in topic.qos} == {"TRANSIENT_LOCAL"}
     return QoSProfile(
