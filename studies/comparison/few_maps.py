@@ -67,7 +67,7 @@ def plan_of(method: str, mirror: Mirror, maps: int) -> Plan:
     """The plan with so many maps.
 
     Raises:
-        ValueError: a plan of hysteresis with too few or too many.
+        TooFewMapsError, ValueError: a plan of hysteresis with too few or too many.
     """
     if method == HYSTERESIS:
         return make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=maps))

@@ -173,6 +173,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "maps_per_state: 1000",
             "reference_every: 4000000000",
             "plan: hysteresis, hysteresis_maps: 5",
+            "plan: hysteresis, hysteresis_maps: 60",
             "plan: hysteresis, hysteresis_maps: 100000",
             "plan: hysteresis, skip_degauss: true",
             "plan: hysteresis, until: .nan",

@@ -57,12 +57,12 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
     found = forecast(plan, 0.5, None, mirror, until=2e-9)
     assert 1e-9 < found.max_zernike < 2e-9 and found.maps < len(plan.steps)
-    assert found.accuracy(2e-9, True).startswith(", moves then right to 1.")
+    assert found.accuracy(2e-9, True).startswith(", moves then right to 2 nm (")
     whole = forecast(plan, 0.5, None, mirror, until=1e-12)
-    assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.6e-9, rel=0.1)
-    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.6 nm (")
+    assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.26e-9, rel=0.02)
+    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.3 nm (")
     short = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=100))
-    assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.5e-9, rel=0.1)
+    assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.1e-9, rel=0.1)
 
 
 def test_what_is_left_follows_from_what_is_reached() -> None:
@@ -87,9 +87,9 @@ def test_before_the_law_is_found_nothing_is_expected() -> None:
     assert expected_end(plan, 130, 2.5e-9, 2e-9, 0.3 * law)[1] == 0.0  # an earlier calibration was better
 
 
-@pytest.mark.parametrize(("rings", "maps"), [(0, 300), (6, 420), (6, 120)])
+@pytest.mark.parametrize(("rings", "maps"), [(0, 300), (6, 420)])
 def test_mirrors_of_one_actuator_and_of_many(rings: int, maps: int) -> None:
-    """Parts with fewer maps than actuators promise nothing; neither does a mirror without neighbours."""
+    """A mirror of one actuator promises nothing, for nothing tells how wide its bump is."""
     mirror = make_mirror(rings=rings)
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=maps, until=1e-3))
     found = forecast(plan, 0.5, None, mirror, until=1e-3)

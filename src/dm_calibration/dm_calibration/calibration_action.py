@@ -12,6 +12,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_maps
+from dm_calibration.hysteresis.excitation import fewest_maps
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
@@ -26,7 +27,7 @@ from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
 
-#: Least time between two feedback messages, s.
+#: Least time between two feedback messages of one phase, s.
 FEEDBACK_PERIOD_S = 0.1
 
 _PHASES = {
@@ -95,12 +96,13 @@ class CalibrateAction:
         goal = self._goal
         if goal.until and goal.plan != PlanKind.HYSTERESIS:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
+        default = LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]
         self._options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],
             surfaces=tuple(goal.surfaces),
             degauss=not goal.skip_degauss,
-            hysteresis_maps=goal.hysteresis_maps or (LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]),
+            hysteresis_maps=goal.hysteresis_maps or max(default, fewest_maps(self._mirror.actuators)),
             until=goal.until,
         )
         self._plan = make_plan(PlanKind(goal.plan or PlanKind.FULL), self._mirror, self._options)
@@ -196,11 +198,12 @@ class CalibrateAction:
 
     def _report(self, phase: str, label: str, step: int) -> None:
         feedback = self._feedback
+        new = phase != feedback.phase
         feedback.phase, feedback.label, feedback.step = phase, label, step
         left = self._plan.steps[step : self._end]
         feedback.maps_left = sum(each.takes_map for each in left)
         feedback.time_left = float(step_times(left, self._services.settle_time, self._services.map_time).sum())
-        if time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
+        if new or time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
             self._sent = time.monotonic()
             self._handle.publish_feedback(feedback)
 

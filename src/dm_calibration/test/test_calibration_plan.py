@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.excitation import REPEATS
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan, shape_in_use
 from dm_common.errors import UnknownNameError
@@ -72,6 +73,11 @@ def test_a_small_mirror_leaves_surfaces_out_or_refuses_them_by_name() -> None:
         make_plan(PlanKind.SURFACES, small, PlanOptions(surfaces=("p25",)))
 
 
+def test_a_run_too_short_for_so_many_actuators_is_refused_before_it_moves() -> None:
+    with pytest.raises(TooFewMapsError, match="hysteresis_maps = 73: must be 74 to 2000 for 37 actuators"):
+        make_plan(PlanKind.HYSTERESIS, make_mirror(), PlanOptions(hysteresis_maps=73))
+
+
 def test_moves_in_use_follow_a_degauss_with_a_map_at_rest() -> None:
     """Each part of a run begins its checks so, and those of many checks have another halfway."""
     plan = make_plan(PlanKind.HYSTERESIS, make_mirror(rings=1), PlanOptions(hysteresis_maps=200, until=2e-9))
@@ -107,7 +113,7 @@ def test_checks_lie_where_the_mirror_is_used() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rings", "most", "looks"), [(3, 420, [80, 100, 120, 160, 200, 240, 300, 380]), (1, 100, [60, 80]), (3, 60, [])]
+    ("rings", "most", "looks"), [(3, 420, [80, 100, 120, 160, 200, 240, 300, 380]), (1, 100, [60, 80]), (3, 74, [])]
 )
 def test_a_run_that_may_end_early_asks_as_soon_as_a_law_can_be_found(rings: int, most: int, looks: list[int]) -> None:
     """60 commands do for a small mirror; 37 actuators need two for each. Later it asks after a quarter more."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
 from dm_common.mirror import Mirror
 
@@ -27,6 +28,8 @@ CHECKS_MANY = 20
 REPEATS = 8
 #: Fewest and most maps of a run, repeats not counted.
 MAPS_MIN, MAPS_MAX = 60, 2000
+#: Fewest maps for each actuator, of which each shows its gain and law beside those of all others.
+MAPS_PER_ACTUATOR = 2
 #: Swings as a share of the range: with fewer full ones errors in use are larger (studies/comparison/NOTES.md).
 SWINGS = (1.0, 1.0, 0.6, 0.3)
 #: Runs of so many maps have random signals up to the ends of the range, by levels that all actuators share. No map
@@ -71,14 +74,24 @@ class Excitation:
         return (checks[0], *([checks[len(checks) // 2]] if len(checks) >= CHECKS_MANY else []))
 
 
+def fewest_maps(actuators: int) -> int:
+    """The fewest maps that a law of so many actuators can be found from."""
+    return max(MAPS_MIN, MAPS_PER_ACTUATOR * actuators)
+
+
 def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     """`maps` commands for `mirror`; the same for the same seed.
 
     Raises:
-        ValueError: too few or too many maps.
+        TooFewMapsError: too few for so many actuators.
+        ValueError: too many.
     """
-    if not MAPS_MIN <= maps <= MAPS_MAX:
-        raise ValueError(f"hysteresis_maps = {maps}: must be {MAPS_MIN} to {MAPS_MAX}")
+    fewest = fewest_maps(mirror.actuators)
+    if maps < fewest:
+        allowed = f"must be {fewest} to {MAPS_MAX} for {mirror.actuators} actuators"
+        raise TooFewMapsError(f"hysteresis_maps = {maps}: {allowed}")
+    if maps > MAPS_MAX:
+        raise ValueError(f"hysteresis_maps = {maps}: must be at most {MAPS_MAX}")
     return _part(mirror, maps, seed, FLAT_KNOWN * mirror.actuators, wide=maps >= WIDE_LEVELS_FROM)
 
 

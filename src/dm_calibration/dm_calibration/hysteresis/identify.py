@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
+from dm_calibration.hysteresis.excitation import MAPS_PER_ACTUATOR
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
@@ -203,7 +204,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     """
     usable = int(run.responses.usable.sum())
     actuators = run.signals.shape[1]
-    needed = 2 * actuators
+    needed = MAPS_PER_ACTUATOR * actuators
     if usable < needed:
         raise ExcitationError(
             f"{usable} usable maps: the hysteresis of {actuators} actuators needs at least {needed}; take 100 to 400"

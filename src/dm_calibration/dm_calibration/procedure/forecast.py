@@ -29,10 +29,10 @@ TYPICAL_DEGAUSS_S = 5.0
 #: the bump, standard deviation in pitches.
 TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 #: What the law of a mirror that is not known leaves of moves after one map for each actuator, m; it falls as the root
-#: of their number. Median of the eight mirrors drawn at random in docs/calibrate.md (2.5 nm after 110 maps, 2.3 after
-#: 160, 1.6 after 312; of the worst of them 5.6, 4.6 and 2.5).
-TYPICAL_LAW = 4.6e-9
-#: The worst of them was so many times as far off; what is farther off has most likely not found the law yet.
+#: of their number. Median of the eight mirrors drawn at random in docs/calibrate.md (2.1 nm after 112 maps, 1.7 after
+#: 162, 1.4 after 314; of the worst of them 3.9, 2.0 and 2.4).
+TYPICAL_LAW = 3.7e-9
+#: The worst of them was up to twice as far off; what is farther off than this has most likely not found the law yet.
 WORST_LAW = 2.2
 
 
@@ -100,10 +100,7 @@ def forecast(
     parts = [*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(steps)]
     expected = Forecast(duration, 0.0)
     for part in parts:
-        try:
-            found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
-        except TooFewMapsError:  # nor does the run end there
-            continue
+        found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
         expected = Forecast(float(time[part - 1]), max(found, float(law / np.sqrt(part))), part)
         if expected.max_zernike <= until:
             break

@@ -7,7 +7,7 @@ from enum import Enum, StrEnum
 
 import numpy as np
 
-from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS, excitation, next_part
+from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS, excitation, fewest_maps, next_part
 from dm_calibration.influence import surfaces
 from dm_common import Floats
 from dm_common.mirror import Mirror
@@ -15,9 +15,9 @@ from dm_common.values import live_parameter, real, whole
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
-#: A run may end when it is accurate enough as soon as there are so many commands for each actuator, and again whenever
-#: there are so many more, as a share of those before; counted in steps. Each part has its checks.
-FIRST_PART, NEXT_PART, PART_STEP = 2.0, 0.25, 20
+#: A run may end when it is accurate enough as soon as a law can be found, and again whenever there are so many commands
+#: more, as a share of those before; counted in steps. Each part has its checks.
+NEXT_PART, PART_STEP = 0.25, 20
 #: Commands after which it ends in any case, where the goal gives no other number.
 LAST_PART_ENDS = 420
 #: Share of the neighbour limit that shapes as in use may take up: rounding must not break it.
@@ -99,7 +99,8 @@ class PlanOptions:
     surfaces: Sequence[str] = ()
     degauss: bool = True
     hysteresis_maps: int = live_parameter(
-        whole(200, MAPS_MIN, MAPS_MAX), "Commands of a hysteresis plan; more, less noise."
+        whole(200, MAPS_MIN, MAPS_MAX),
+        "Commands of a hysteresis plan, at least two for each actuator; more, less noise.",
     )
     until: float = 0.0
 
@@ -120,6 +121,7 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
     Raises:
         UnknownNameError: a surface that Table 1 does not have, naming the near ones.
         ValueError: a surface asked for by name that this mirror cannot have, or an option out of its range.
+        TooFewMapsError: too few maps to find the hysteresis of so many actuators.
     """
     options = options or PlanOptions()
     if kind is PlanKind.HYSTERESIS:
@@ -141,7 +143,7 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     """A degauss, repeated maps at rest, and the excitation with its degausses, a map at rest after each.
 
     Raises:
-        ValueError: a run that would not begin with a degauss, or of too few or too many maps.
+        TooFewMapsError, ValueError: as `excitation`; ValueError, a run that would not begin with a degauss.
     """
     if not options.degauss:
         raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
@@ -173,7 +175,7 @@ def _parts(options: PlanOptions, actuators: int) -> list[int]:
     most = options.hysteresis_maps
     if not options.until:
         return [most]
-    ends = [max(MAPS_MIN, PART_STEP * math.ceil(FIRST_PART * actuators / PART_STEP))]
+    ends = [PART_STEP * math.ceil(fewest_maps(actuators) / PART_STEP)]
     while ends[-1] < most:
         ends.append(ends[-1] + PART_STEP * max(1, round(NEXT_PART * ends[-1] / PART_STEP)))
     # A rest that is too short to be a part of its own joins the last.
