@@ -125,6 +125,8 @@ def test_a_whole_number_counts_as_a_float_and_an_empty_list_is_one(observer: Obs
         assert values[name] == number
     assert node.set_parameters([RosParameter("levels", value=["3e-01", "4e-01"])])[0].successful
     assert values["levels"] == [0.3, 0.4]
+    with pytest.raises(ParameterNotDeclaredException, match=r"levels = 0\.5: must be"):
+        node.set_parameters([RosParameter("levels", value=0.5)])
     node.destroy_node()
     empty = Node(
         "empty", parameter_overrides=[RosParameter("serial", value="S1"), RosParameter("positions", value=None)]

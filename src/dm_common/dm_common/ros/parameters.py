@@ -268,11 +268,13 @@ def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
 
 def _numbers(value: Value, given: Any) -> Any:
     """`given`, where YAML took floats for a text: it does so with 3e-08, and `ros2 param` with it."""
+    if value.item is not float:
+        return given
     texts = given.strip("[]").split(",") if value.many and isinstance(given, str) else given
     with suppress(ValueError):
-        if value.item is float and isinstance(texts, str):
+        if isinstance(texts, str):
             return float(texts)
-        if value.item is float and value.many and texts and all(isinstance(text, str) for text in texts):
+        if isinstance(texts, list) and all(isinstance(text, str) for text in texts):
             return [float(text) for text in texts]
     return given
 
