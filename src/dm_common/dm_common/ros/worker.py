@@ -1,7 +1,8 @@
 """Work that waits, beside an executor that never does.
 
-A callback that would block (settling, files, fits, other services) runs in a worker thread; its outcome is handed back
-to the executor, which sends the response. Streams are served undisturbed meanwhile and nothing polls.
+A service or action callback that would block (settling, files, fits, other services) runs as ordinary code in a worker
+thread; its outcome is handed back to the executor, which sends the response. While it runs, streams are served
+undisturbed and nothing polls.
 """
 
 import threading
