@@ -14,13 +14,14 @@ from rclpy.service import Service
 from std_srvs.srv import Trigger
 
 from dm_common.ros import executor
+from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer, WorkerService
 from ros_fixtures import Observer, wait_until
 
 
-def test_the_middleware_takes_a_tenth_of_a_second_to_drop_an_answer(
-    observer: Observer, monkeypatch: pytest.MonkeyPatch
+def test_the_middleware_takes_a_tenth_of_a_second_to_drop_an_answer_which_is_not_printed(
+    recwarn: pytest.WarningsRecorder, observer: Observer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A client that wants the answers of before its time never matches a server that keeps none."""
     dropped: list[bool] = []
@@ -39,6 +40,7 @@ def test_the_middleware_takes_a_tenth_of_a_second_to_drop_an_answer(
     client = observer.node.create_client(Trigger, "ask", qos_profile=latched)
     wait_until(lambda: client.call_async(Trigger.Request()) and len(dropped) > 5)
     assert all(dropped[1:])
+    assert not [warning for warning in recwarn if "send response" in str(warning.message)]
 
 
 class Dropping:
@@ -104,6 +106,33 @@ def test_a_request_that_is_slowly_handed_to_its_worker_is_carried_out_once(
     observer.call(Trigger, "ask", Trigger.Request())
     time.sleep(2 * executor.PAUSES_S[0])
     assert len(carried_out) == 1
+    served.destroy_node()
+
+
+def test_a_request_that_was_lost_is_sent_once_more_where_it_may_be_carried_out_twice(observer: Observer) -> None:
+    """What a server that has not discovered the client yet never hears; here it hears and says nothing."""
+    server = Node("server", context=observer.node.context)
+    service = server.create_service(Trigger, "ask", lambda request, response: Trigger.Response(message="here"))
+    answer, lost = service.send_response, []
+
+    def forgetful(*arguments: Any) -> None:
+        if len(lost) < losses:
+            lost.append(arguments)
+        else:
+            answer(*arguments)
+
+    service.send_response = forgetful
+    served = BackgroundExecutor(server)
+    client = observer.node.create_client(Trigger, "ask")
+    losses = 1
+    assert call(client, Trigger.Request(), timeout_s=20.0, again_s=0.1).message == "here"
+    losses = 2
+    with pytest.raises(ServiceCallError, match=r"no answer within 0\.5 s"):
+        call(client, Trigger.Request(), timeout_s=0.5)
+    losses = 10
+    with pytest.raises(ServiceCallError, match=r"no answer within 0\.5 s"):
+        call(client, Trigger.Request(), timeout_s=0.5, again_s=0.1)
+    assert len(lost) == 4  # once more, not for ever
     served.destroy_node()
 
 

@@ -1,5 +1,6 @@
 """Clients for threads that may wait: of services, of actions, and one that holds the mirror against others."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -34,10 +35,23 @@ class ServiceCallError(Exception):
         self.error_code = error_code
 
 
-def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], object] = lambda: False) -> Any:
+def call(
+    client: Client,
+    request: Any,
+    timeout_s: float,
+    cancelled: Callable[[], object] = lambda: False,
+    again_s: float = math.inf,
+) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
     Never call this from an executor callback: it would wait for itself.
+
+    Args:
+        client: of the service.
+        request: to send.
+        timeout_s: longest wait for the server, and for its answer.
+        cancelled: ends the wait.
+        again_s: without an answer the request is sent again after so long, once; for one that may be carried out twice.
 
     Raises:
         ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
@@ -50,13 +64,21 @@ def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[],
             raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
         time.sleep(0.02)
     done = threading.Event()
-    future = client.call_async(request)
-    future.add_done_callback(lambda _future: done.set())
+
+    def send() -> Any:
+        future = client.call_async(request)
+        future.add_done_callback(lambda _future: done.set())
+        return future
+
+    future, again = send(), time.monotonic() + again_s
     while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
         if cancelled() or time.monotonic() > deadline:
             client.remove_pending_request(future)
             reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
             raise ServiceCallError(f"{client.srv_name}: {reason}")
+        if time.monotonic() > again and not future.done():
+            client.remove_pending_request(future)
+            future, again = send(), math.inf
     return future.result()
 
 

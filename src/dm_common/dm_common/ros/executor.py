@@ -13,7 +13,8 @@ with care (measured with rclpy 7.1.6):
   each holds its node: see `destroy`.)
 * A client may have discovered a server on a busy machine before that one has discovered the client. rmw_fastrtps then
   waits 0.1 s for it and drops the answer, of which rclpy tells only by a warning ("client will not receive response"):
-  whoever asked waits for ever (ros2/rmw_fastrtps#706, ros2/rclcpp#2760). `until_discovered` sends it again.
+  whoever asked waits for ever (ros2/rmw_fastrtps#706, ros2/rclcpp#2760). `until_discovered` sends it again, and says
+  when it is lost for good; the warning is not printed.
 * A signal may raise KeyboardInterrupt inside any callback, and is not noticed while the loop sleeps. `StopOnSignals`
   turns SIGINT and SIGTERM into an orderly end instead.
 """
@@ -26,6 +27,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -59,6 +61,7 @@ PAUSES_S = (0.3, 1.0, 3.0)
 
 def make_executor(*nodes: Node) -> Executor:
     """Return the suite's executor with `nodes` (at least one, all of one context) added."""
+    warnings.filterwarnings("ignore", "failed to send response", RuntimeWarning)  # see `until_discovered`
     executor = EventsExecutor(context=nodes[0].context)
     for node in nodes:
         executor.add_node(node)
