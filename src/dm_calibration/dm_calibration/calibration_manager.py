@@ -125,8 +125,8 @@ class CalibrationManager:
                 file = None
             self._publish(self.in_use, file)
 
-    def load(self, name: str) -> Calibration:
-        """Load by id or file, or the newest that fits when `name` is empty, and use it.
+    def load(self, name: str) -> tuple[Calibration, str]:
+        """Load by id or file, or the newest that fits when `name` is empty, and use it. Returns it and what `use` does.
 
         Raises:
             Refusal: no mirror, or the calibration belongs to another; the one in use stays.
@@ -144,13 +144,13 @@ class CalibrationManager:
                     ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}"
                 )
             calibration = newest
-        self.use(calibration)
-        return calibration
+        return calibration, self.use(calibration)
 
     def load_last(self) -> tuple[Calibration, str]:
         """Use the calibration that the mirror used last, or the newest that fits where that is not known.
 
-        Returns it, and why it is not the one used last, as a sentence; "" = it is, or none is known.
+        Returns it, and why it is not the one used last, as a sentence, or else what `use` does; "" = it is, or none is
+        known.
 
         Raises:
             Refusal: no mirror, the node rests, or no calibration fits.
@@ -158,10 +158,11 @@ class CalibrationManager:
         last, reason = self.store.last_in_use(self.known_mirror().serial), ""
         if last and not self._resting():
             try:
-                return self.load(last), ""
+                return self.load(last)
             except EXPECTED as error:
                 reason = f"in use last was {last}: {error}"
-        return self.load(""), reason
+        calibration, warning = self.load("")
+        return calibration, reason or warning
 
     def _checked_in_use(self, calibration_id: str) -> Calibration:
         calibration = self.in_use

@@ -161,7 +161,7 @@ class CalibrationNode(ManagedNode):
             if name == "last":
                 calibration, reason = self._manager.load_last()
             else:
-                calibration, reason = self._manager.load("" if name == "newest" else name), ""
+                calibration, reason = self._manager.load("" if name == "newest" else name)
             self._log_report(f"calibration {calibration.id} loaded at start{reason and '; '}{reason}", bool(reason))
         except EXPECTED as error:
             if name in ("last", "newest") and error_code(error) == ErrorCode.NOT_CALIBRATED:  # a bench that is new
@@ -187,8 +187,9 @@ class CalibrationNode(ManagedNode):
         return response
 
     def _on_load(self, request: Any, response: Any) -> Any:
-        response.id = self._manager.load(request.calibration).id
-        response.message = f"calibration {response.id} is in use"
+        calibration, warning = self._manager.load(request.calibration)
+        response.id = calibration.id
+        response.message = f"calibration {response.id} is in use{warning and '; '}{warning}"
         return response
 
     def _on_fit(self, request: Any, response: Any) -> Any:

@@ -93,6 +93,7 @@ def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calib
     (stand.store.folder / "in_use_T-1.txt").mkdir()
     assert "warning: known is in use, but the next start will not know: " in stand.manager.use(calibration)
     assert stand.published[-1] is calibration
+    assert "the next start will not know: " in stand.manager.load("known")[1]
 
 
 def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:

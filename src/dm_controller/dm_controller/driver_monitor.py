@@ -152,12 +152,18 @@ class DriverMonitor:
         return None
 
     def check(self, request: FocusRequest, now: float) -> None:
-        """Raise what `refusal` gives, or that somebody else holds the mirror and `request` does not take it over."""
+        """Raise what `refusal` gives, or what `held` does."""
         if (refusal := self.refusal(now)) is not None:
             raise refusal
+        if (refusal := self.held(request)) is not None:
+            raise refusal
+
+    def held(self, request: FocusRequest) -> Refusal | None:
+        """That somebody else holds the mirror and `request` does not take it over; None = it may have it."""
         report = self.latest
-        if report is not None and report.holder not in ("", request.holder) and not request.take_over:
-            raise Refusal(ErrorCode.BUSY, report.holding)
+        if report is None or report.holder in ("", request.holder) or request.take_over:
+            return None
+        return Refusal(ErrorCode.BUSY, report.holding)
 
     def settled(self, replaced: str = "") -> list[PublishState]:
         """What came of the last order's command, once: the driver has confirmed it, or it is `replaced` before."""

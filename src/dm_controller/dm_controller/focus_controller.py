@@ -199,6 +199,8 @@ class FocusController:
                 else:
                     effects += self._condition(order, move, now)
         except Refusal as refusal:
+            if self.active is None and refusal is self.not_calibrated and not dry_run:
+                refusal = self.monitor.held(order.request) or refusal  # the first calibration runs, for example
             self.refused += 1
             order.refusal = refusal
             effects.append(Log("warning", f"refused: {refusal}"))

@@ -351,6 +351,20 @@ def test_a_request_that_makes_no_sense_is_told_so_without_a_calibration_too(benc
     assert bench.refusal().error_code == ErrorCode.NOT_CALIBRATED
 
 
+def test_without_a_calibration_a_request_beside_the_first_run_is_told_who_holds_the_mirror(bench: Bench) -> None:
+    bench.do(bench.controller.rest(Refusal(ErrorCode.NOT_CALIBRATED, "no calibration"), bench.now))
+    bench.holder = "calibration"
+    bench.report()
+    bench.ask(0.01)
+    assert bench.refusal().error_code == ErrorCode.BUSY and "calibration holds it" in str(bench.refusal())
+    for fields in ({"take_over": True}, {"holder": "calibration"}):
+        bench.ask(0.01, **fields)
+        assert bench.refusal().error_code == ErrorCode.NOT_CALIBRATED
+    bench.ask(float("nan"))
+    assert bench.refusal().error_code == ErrorCode.NOT_FINITE
+    assert bench.commands == []
+
+
 def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its_way(bench: Bench) -> None:
     fresh = FocusController(VALUES)
     fresh.use(None, None)

@@ -23,7 +23,7 @@ from dm_common.ros.parameters import frame_id
 from dm_tools.console import console_node
 from dm_tools.security.interfaces import interfaces
 
-CONFIG = Path(__file__).resolve().parents[2] / "src" / "dm_bringup" / "config"
+CONFIG = Path(__file__).resolve().parents[2] / "dm_bringup" / "config"
 #: What layouts may show: the console's topics, and the focus, of which it shows what `actuator_state` says.
 TOPICS = console_node.TOPICS | {"focus_state": (FocusState, qos.STATE)}
 #: Topics that every ROS 2 system has.
