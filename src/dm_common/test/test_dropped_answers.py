@@ -113,7 +113,8 @@ def test_a_request_that_was_lost_is_sent_once_more_where_it_may_be_carried_out_t
     """What a server that has not discovered the client yet never hears; here it hears and says nothing."""
     server = Node("server", context=observer.node.context)
     service = server.create_service(Trigger, "ask", lambda request, response: Trigger.Response(message="here"))
-    answer, lost = service.send_response, []
+    answer = service.send_response
+    lost: list[Any] = []
 
     def forgetful(*arguments: Any) -> None:
         if len(lost) < losses:

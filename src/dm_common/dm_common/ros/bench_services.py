@@ -143,13 +143,12 @@ class BenchServices:
     def apply(self, signals: Floats) -> Floats:
         request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder)
         with self._answered("set_signals", self._driver, self._set_signals.service_is_ready) as stop:
-            # A driver that was just started again may not have discovered this client yet: such a request is lost.
+            # A driver that was just started again may not have discovered this client yet: what it is sent is lost.
             again = qos.RETURN_S if self._driver.changed_within(qos.APPEAR_S) else math.inf
             response = call(self._set_signals, request, self._values["driver_timeout"], stop, again)
         self._check("set_signals", response)
         self._commanded = signals
-        applied = np.array(response.applied, dtype=np.float64)
-        return applied if applied.shape == signals.shape else signals
+        return np.array(response.applied) if len(response.applied) == len(signals) else signals
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         try:
