@@ -63,6 +63,7 @@ class FilmedScene:
         self.object_curvature = object_curvature
         self.refuse_beyond = HIGH
         self.dead = False
+        self.degausses = 0  # requests that wait for one before they are carried out
         self.requests: list[FocusRequest] = []
         self.asked: list[FocusRequest] = []  # by the service `set_focus`
         self.history_known = False
@@ -153,6 +154,10 @@ class FilmedScene:
         if self.dead:
             return
         self.requests.append(request)
+        if self.degausses:
+            self.degausses -= 1
+            self._state.publish(FocusState(curvature=request.curvature, message="the mirror is degaussed first"))
+            time.sleep(0.2)
         state = self._judge(request)
         if state.applied:
             with self._lock:
@@ -226,6 +231,13 @@ def test_the_sharpest_focus_is_found_and_told_as_distance(scene: FilmedScene, ob
     assert found.images == len(feedback)
     assert scene.requests[-1].curvature == found.curvature
     assert {item.phase for item in feedback} == {AutofocusState.PHASE_COARSE, AutofocusState.PHASE_FINE}
+
+
+def test_a_degauss_that_runs_for_somebody_else_is_waited_for(scene: FilmedScene, observer: Observer) -> None:
+    scene.degausses = 2
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.OK, found.message
+    assert found.curvature == pytest.approx(0.0173, abs=0.0012)
 
 
 def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer: Observer) -> None:

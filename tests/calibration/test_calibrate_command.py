@@ -51,6 +51,12 @@ def test_maps_of_another_plan_are_no_hysteresis_run(option: tuple[str, str]) -> 
     assert found.exit_code == 2 and f"--plan pokes and {option[0]}: must be the plan hysteresis" in found.output
 
 
+@pytest.mark.parametrize("plan", [(), ("--plan", "surfaces")])
+def test_an_amplitude_of_pokes_is_for_plans_with_pokes(plan: tuple[str, ...]) -> None:
+    found = CliRunner().invoke(cli.app, ["calibrate", *plan, "--amplitude", "0.3"])
+    assert found.exit_code == 2 and "--amplitude: must be a plan with pokes" in found.output.replace("\n", " ")
+
+
 def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:
     target = tmp_path / "my_bench.yaml"
     write_parameters("", target, source_of(target, None, "virtual-1"))

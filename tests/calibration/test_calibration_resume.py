@@ -108,9 +108,15 @@ def test_each_map_is_measured_once_however_often_the_power_fails(tmp_path: Path)
 
 
 def test_what_is_read_back_is_bit_for_bit_what_was_measured(tmp_path: Path) -> None:
-    run = opened(tmp_path, POKES)
-    live = procedure(run, POKES, lagging_bench()).run()
+    run, bench = opened(tmp_path, POKES), lagging_bench()
+    good = bench.measure
+    turned = {"orientation": (True, False, 90.0), "camera": (640, 480), "pitch": 5e-5, "reference_surface": "flat"}
+    place = {"centre": (320.5, 239.0), "followed": (319.0, 240.0), "radius_px": 200.0}
+    bench.measure = lambda label: replace(good(label), **turned, **place)  # type: ignore[method-assign,arg-type]
+    live = procedure(run, POKES, bench).run()
     again = read_run(run.journal.folder).outcome
+    for name in (*turned, *place):  # what a wrong poke check is mended by
+        assert [getattr(each, name) for each in again.records] == [getattr(each, name) for each in live.records]
     assert map_hashes(again.maps()) == map_hashes(live.maps())
     assert np.array_equal(again.centres, live.centres, equal_nan=True)
     calibration = calibrate(again, mirror=MIRROR, options=FitOptions(), provenance=Provenance("resumed", 1))

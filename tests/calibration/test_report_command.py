@@ -30,6 +30,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> CalibrationStore:
     return store
 
 
+@pytest.fixture(autouse=True)
+def _nothing_runs(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+
+
 def test_the_newest_is_reported(store: CalibrationStore, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
     report("", tmp_path / "out", store.folder, json=figures)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import (
     ActuatorCommand,
@@ -365,6 +366,17 @@ def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain
     assert all(0 <= time.time_ns() - state.log_time < 60 * 10**9 for state in states)
     assert bag.topics["/mirror_info"].qos[0].durability.name == "TRANSIENT_LOCAL"
     assert bag.topics["/mirror_info"].type_hash.startswith("RIHS01_")
+
+
+def test_of_two_mirrors_only_the_one_that_is_named_is_recorded(observer: Observer, domain: int, tmp_path: Path) -> None:
+    """And what they share; the one that is not named may be without a namespace."""
+    for name in ("actuator_state", "left/actuator_state", "right/actuator_state"):
+        observer.node.create_publisher(ActuatorState, name, qos.LATCHED).publish(ActuatorState())
+    observer.node.create_publisher(DiagnosticArray, "diagnostics", qos.LATCHED).publish(DiagnosticArray())
+    with Recorder(tmp_path / "bag", "left", domain=domain) as recorder:
+        wait_until(lambda: {"/left/actuator_state", "/diagnostics"} <= recorder.counts.keys(), 60)
+        wait_until(lambda: observer.node.count_subscribers("/diagnostics"), 60)
+        assert not {"/actuator_state", "/right/actuator_state"} & recorder.counts.keys()
 
 
 def test_what_was_recorded_is_in_the_file_though_nothing_follows(

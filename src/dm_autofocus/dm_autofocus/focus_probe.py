@@ -140,7 +140,8 @@ class FocusProbe:
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
-                self.answer = self.answer or message
+                if message.applied or message.error_code != ErrorCode.OK:  # else it waits for a degauss that runs
+                    self.answer = self.answer or message
             elif message.applied and message.curvature not in self._asked:
                 self._other_request = message.curvature
             self._changed.notify_all()
@@ -224,7 +225,7 @@ class FocusProbe:
             text = f"no answer to a focus request within {limit:g} s: is focus_controller running?"
             raise Refusal(ErrorCode.TIMEOUT, gone() or text)
         if not answer.applied:
-            raise Refusal(answer.error_code or ErrorCode.INTERNAL, answer.message)
+            raise Refusal(answer.error_code, answer.message)
         with self._changed:
             self._gate.sent(seconds(answer.header.stamp), answer.predicted_duration)
             self._update_gate()

@@ -39,6 +39,7 @@ _ATTRIBUTES: dict[str, type] = {
     "targets": tuple,
     "limitations": tuple,
     "note": str,
+    "system_error_subtracted": int,
     "reference_surface": str,
     "instrument_error": float,
     "scale_error": float,
@@ -67,6 +68,7 @@ class Calibration:
         targets: the shapes that were solved from an influence function; their coefficients are maps.nominal.
         limitations: sentences; those of the fit, of the run, and of the poke check.
         hysteresis: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
+        system_error_subtracted: by the instrument itself, from all maps: 1 yes, 0 no, -1 not known.
         reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
             none.
         instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.
@@ -91,6 +93,7 @@ class Calibration:
     software_version: str = ""
     hysteresis: HysteresisFit | None = None
     recipes: RecipeBook = NO_RECIPES
+    system_error_subtracted: int = -1
     reference_surface: str = ""
     instrument_error: float = 0.0
     scale_error: float = 0.0
@@ -186,7 +189,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
         # Nothing was known of the instrument before it was kept.
-        attributes = {"reference_surface": "", "instrument_error": 0.0, "scale_error": 0.0, **attributes}
+        attributes = {"system_error_subtracted": -1, "reference_surface": "", **attributes}
+        attributes = {"instrument_error": 0.0, "scale_error": 0.0, **attributes}
         result: dict[str, Any] = {"points": points}
         for figure in fields(InfluenceFit):
             if figure.name == "points":

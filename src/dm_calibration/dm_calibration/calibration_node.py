@@ -55,7 +55,7 @@ class CalibrationNode(ManagedNode):
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
         self._recipes = self.create_publisher(RecipeBook, "recipes", qos.LATCHED)
-        self._reports = ReportWriter(self._log_report, lambda: self._values["calibrated_error_max"])
+        self._reports = ReportWriter(self._log_report, self._values)
         self._manager = CalibrationManager(
             CalibrationStore(self._values["calibration_folder"], self._write_report),
             lambda: float(self._values["aperture_tolerance"]),
@@ -200,7 +200,9 @@ class CalibrationNode(ManagedNode):
         if request.activate:
             self._manager.check_fits(stored)
         provenance = self._manager.provenance(stored.mirror_name, stored.mirror_serial, "")
-        calibration = refit(stored, fit_options(self._values, request.method), request.exclude, provenance)
+        mirror = None if self._manager.mismatch(stored) else self._manager.mirror
+        options = fit_options(self._values, request.method)
+        calibration = refit(stored, options, request.exclude, provenance, mirror)
         response.file = str(self._manager.store.save(calibration))
         response.id = calibration.id
         response.in_sample_rms = calibration.fit.in_sample_rms

@@ -22,7 +22,7 @@ from dm_common import Floats
 from dm_common.mirror import Mirror
 
 #: What a calibration keeps of the setup of its run.
-_INSTRUMENT = ("reference_surface", "instrument_error", "scale_error")
+_INSTRUMENT = ("system_error_subtracted", "reference_surface", "instrument_error", "scale_error")
 
 
 @dataclass(frozen=True)
@@ -180,14 +180,23 @@ def fit_effective(
     return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 
 
-def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], provenance: Provenance) -> Calibration:
+def refit(
+    stored: Calibration,
+    options: FitOptions,
+    exclude: Collection[str],
+    provenance: Provenance,
+    mirror: Mirror | None = None,
+) -> Calibration:
     """A new calibration from the raw data of `stored`, without the maps in `exclude`.
+
+    Args:
+        mirror: that it is of, by whose limits errors are told where hysteresis is not followed; None = one without.
 
     Raises:
         UnknownNameError: an unknown method or label.
         TooFewMapsError: the maps left do not determine the unknowns.
     """
-    mirror = Mirror(
+    mirror = mirror or Mirror(
         stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
     )
     fit = fit_effective(stored.maps, stored.hysteresis, options, mirror, exclude)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from typing import Any
 
 import numpy as np
 
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.procedure.event_frames import _plain
 from dm_common.measurement import Measurement
 
 
@@ -32,6 +30,8 @@ def map_hashes(maps: MapSet) -> list[str]:
 
 def record_hash(record: Measurement) -> str:
     """The same of one map."""
-    arrays: list[bytes] = []
-    head = json.dumps(_plain(record, arrays))
-    return hashlib.sha256(head.encode() + b"".join(arrays)).hexdigest()
+    digest = hashlib.sha256()
+    for name in MapSet.columns():
+        value = getattr(record, name)
+        digest.update(name.encode() + (value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()))
+    return digest.hexdigest()

@@ -140,6 +140,16 @@ def test_command_whose_file_is_found_in_the_folder(tmp_path: Path, bench: Any) -
     assert one.files == []
 
 
+def test_a_map_of_a_command_that_fails_afterwards_is_a_file_like_any_other(tmp_path: Path, bench: Any) -> None:
+    (tmp_path / "source").write_bytes(MAP)
+    code = "import shutil, sys, time; shutil.copy(sys.argv[1], sys.argv[2]); time.sleep(1); sys.exit(3)"
+    one = bench(tmp_path, python(code, str(tmp_path / "source"), str(tmp_path / "from_instrument.dat")))
+    with pytest.raises(TriggerError, match="status 3"):
+        one.acquisition.acquire(20)
+    wait_until(lambda: one.files, what="the map")
+    assert one.files == [tmp_path / "from_instrument.dat"]
+
+
 def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, bench: Any) -> None:
     one = bench(tmp_path)
     results: list[Any] = []

@@ -19,7 +19,7 @@ from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
-from dm_calibration.influence.fit import fit_influence
+from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -107,6 +107,13 @@ def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
         errors.append(np.abs(seen[3:]).max())
     bound = fit.held_out_max_zernike
     assert np.mean(np.array(errors) <= bound) >= 0.95 and 0.2 * bound < max(errors)
+    # Fitted again it promises the same, inside the limits of its mirror.
+    tight = replace(MIRROR, limits=replace(MIRROR.limits, neighbour_difference=0.3))
+    again, tighter = (
+        calibrator.refit(calibration, FitOptions(), (), calibrator.Provenance("again", 2), mirror).promise
+        for mirror in (MIRROR, tight)
+    )
+    assert again == pytest.approx(bound, rel=1e-9) and tighter < 0.7 * bound
     # The same bench whose signals begin at 0 instead: a move is counted from mid range on.
     maps = replace(calibration.maps, applied=calibration.maps.applied + 1.0)
     pulled = fit_influence(maps, rings=MIRROR.rings, limits=replace(MIRROR.limits, low=0.0, high=2.0))

@@ -65,6 +65,14 @@ def test_chosen_surfaces_only() -> None:
         make_plan(PlanKind.SURFACES, make_mirror(), PlanOptions(surfaces=("p59",)))
 
 
+@pytest.mark.parametrize("kind", [PlanKind.HYSTERESIS, PlanKind.POKES, PlanKind.POKE_CHECK])
+def test_surfaces_of_a_plan_without_any_are_refused(kind: PlanKind) -> None:
+    with pytest.raises(ValueError, match=rf"surfaces = p06, p07: the plan {kind.name.lower()} measures none of them"):
+        make_plan(kind, make_mirror(), PlanOptions(surfaces=("p06", "p07")))
+    with pytest.raises(UnknownNameError):
+        make_plan(kind, make_mirror(), PlanOptions(surfaces=("nonsense",)))
+
+
 def test_a_small_mirror_leaves_surfaces_out_or_refuses_them_by_name() -> None:
     small = make_mirror(rings=2)
     plan = make_plan(PlanKind.SURFACES, small)

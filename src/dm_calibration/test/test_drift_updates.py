@@ -168,7 +168,7 @@ def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made
     bench.apply(at)
     map_ = bench.measure("stuck")
     assert "./dm check --without 7 --without 12 goes on without" in updates.take(map_, settled, dry_run=True).reason
-    verdict = updates.take(map_, settled, without=stuck)
+    verdict = updates.take(map_, settled, without=[*stuck, *stuck])  # named twice it stands where it stands
     assert verdict.accepted and not updates.mirror_changed
     assert "Goes on without actuators 7 (stands at " in verdict.reason and ", 12 (stands at +0.30)" in verdict.reason
     for manager in (updates, begun(made, tmp_path)):  # it is stored
@@ -389,6 +389,31 @@ def test_maps_that_cannot_be_compared_are_refused(
     with pytest.raises(MapNotUsableError, match=words):
         updates.take(change(bench.measure("check")), bench.settled())
     assert known(updates).revision == 0
+
+
+def test_a_map_from_which_the_instrument_took_something_else_is_refused(
+    bench: SteadyMirror, made: Made, tmp_path: Path
+) -> None:
+    updates = begun((made[0], replace(made[1], system_error_subtracted=0)), tmp_path)
+    measured = bench.measure("check")
+    with pytest.raises(MapNotUsableError, match="system_error_subtracted = 1, in the calibration's maps 0"):
+        updates.take(replace(measured, system_error_subtracted=1), bench.settled())
+    assert updates.take(measured, bench.settled()).accepted  # not known of it
+
+
+def test_options_that_change_while_a_calibration_is_in_use_count_for_the_next_map(
+    bench: SteadyMirror, made: Made, tmp_path: Path
+) -> None:
+    options = EXACT
+    updates = RecalibrationManager(tmp_path, lambda: options)
+    updates.begin(made[1])
+    assert updates.take(bench.measure("first"), bench.settled()).accepted
+    bench.drift(2e-2)
+    measured, settled = bench.measure("check"), bench.settled()
+    exact = updates.take(measured, settled, dry_run=True).comparison.surprise
+    options = replace(EXACT, signal_sigma=0.1)
+    assert updates.take(measured, settled, dry_run=True).comparison.surprise < 0.1 * exact
+    assert known(updates).revision == 1  # what was learnt stays
 
 
 def test_points_without_data_do_no_harm(bench: SteadyMirror, updates: RecalibrationManager) -> None:

@@ -13,6 +13,7 @@ import pytest
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import NoValidPixelsError, read_map
+from dm_calibration.map_files.fits import fits_bytes
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.optics.orientation import Orientation
 from dm_common.measurement import Measurement
@@ -109,6 +110,15 @@ def test_a_reference_is_a_map_of_the_instruments_wavelength(surface: Path, tmp_p
         load_reference(str(surface), "", 532e-9, 1e-9)
     with pytest.raises(ValueError, match=r"reference_surface: .*missing.dat: No such file"):
         load_reference(str(tmp_path / "missing.dat"), "", 0.0, 1e-9)
+
+
+def test_a_reference_that_does_not_tell_its_wavelength_is_believed_as_maps_are(surface: Path, tmp_path: Path) -> None:
+    flat, content = tmp_path / "flat.fits", read_map(surface)
+    flat.write_bytes(fits_bytes(dataclasses.replace(content, wavelength=0.0), "a test"))
+    reference = load_reference(str(flat), "", WAVELENGTH, 1e-9)
+    assert reference.wavelength == 0.0
+    measured = Ingest().measure(content, IngestSettings(reference=reference, wavelength=WAVELENGTH))[1]
+    np.testing.assert_allclose(measured.coefficients, 0.0, atol=1e-15)
 
 
 def test_a_sphere_of_known_radius_gives_the_lateral_scale(surface: Path) -> None:

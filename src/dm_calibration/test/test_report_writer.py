@@ -12,6 +12,7 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
+from dm_calibration.report.checks import DEFAULTS
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
 from hysteretic_mirror import lagging_bench
@@ -30,10 +31,12 @@ def calibration() -> Calibration:
 
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
     published: list[tuple[str, bool]] = []
-    writer = ReportWriter(lambda text, warning: published.append((text, warning)))
+    values = DEFAULTS | {"updates.stale_after": 7 * 86400.0}
+    writer = ReportWriter(lambda text, warning: published.append((text, warning)), values)
     store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)
     writer.finish()
+    assert "<td>valid until</td><td>2001-09-16 " in (tmp_path / "c1.html").read_text()  # made on the ninth
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c1.h5", "c1.html", "c1.pdf"]
     assert published == [("report written: c1.html and .pdf beside the calibration", False)]
     assert [entry.id for entry in store.entries()] == ["c1"]

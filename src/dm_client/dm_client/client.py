@@ -101,7 +101,7 @@ class DeformableMirrorClient(Connection):
         Raises DeformableMirrorError when none came within the time.
         """
         if not self.wait(lambda: topic in self.messages, timeout_s):
-            raise DeformableMirrorError(ErrorCode.INTERNAL, f"no message on {topic}: are the nodes running (./dm up)?")
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")
         return self.messages[topic]
 
     def wait_until_active(self, timeout_s: float = 20.0) -> None:
@@ -212,6 +212,8 @@ class DeformableMirrorClient(Connection):
         `forget` takes no map but drops all earlier updates. `without` are numbers, from 1, of actuators that do not
         move any more: from now on they count as without effect, standing where the map shows them.
         """
+        if not all(0 < number < 1 << 16 for number in without):  # the message would hold no others
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"without = {list(without)}: numbers count from 1")
         request = UpdateCalibration.Request(dry_run=dry_run, forget=forget, without=list(without), **claim)
         return self.call("update_calibration", request, timeout_s)
 

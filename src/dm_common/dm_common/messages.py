@@ -129,6 +129,16 @@ def measurement_from(response: Any) -> Measurement:
     )
 
 
+def unused_as_requested(report: ActuatorState) -> ActuatorState:
+    """`report`, with what was requested of actuators without a channel as what was applied: they follow nothing, and
+    where they rest is no shape to correct or to keep.
+    """
+    unused = np.bitwise_and(np.asarray(report.flags, dtype=np.uint8), ActuatorState.FLAG_UNUSED) > 0
+    if unused.any() and len(report.requested) == len(report.applied) == len(unused):
+        report.applied = doubles(np.where(unused, report.requested, report.applied))
+    return report
+
+
 def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
     """What the driver reports as applied, `heard` now (s)."""
     signals = np.array(message.applied, dtype=np.float64)

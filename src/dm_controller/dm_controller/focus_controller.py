@@ -14,7 +14,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
-from dm_common.messages import applied_from, stamp_ns
+from dm_common.messages import applied_from, stamp_ns, unused_as_requested
 from dm_controller.conditioning import Conditioning
 from dm_controller.creep_hold import CreepHold
 from dm_controller.driver_monitor import DriverMonitor
@@ -108,6 +108,7 @@ class FocusController:
 
     def driver_report(self, report: ActuatorState, now: Moment) -> list[Effect]:
         """Take the driver's next report."""
+        report = unused_as_requested(report)
         latency_learnt = self.monitor.observe(report, now.steady)
         with suppress(ValueError):  # the observer says so as long as the history is unknown, and begins anew
             self.observer.observe(applied_from(report, now.time), self.monitor.clock_gain(report, now))
@@ -295,5 +296,5 @@ class FocusController:
         last.kept = False
         effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
         if report is not None and len(report.applied):
-            effects.append(last.send_on(np.array(report.applied), now))
+            effects.append(last.leave_at(np.array(report.applied), now))
         return effects

@@ -97,6 +97,11 @@ class Order:
         self.command = SendCommand(signals, now, expected_turns, self.request.holder)
         return self.command
 
+    def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
+        """A command to stay where the mirror stands (N,), which quantised may break a limit by a step."""
+        assert self.active is not None  # else nothing was commanded
+        return self.send_on(self.active.mirror.limits.scaled(signals)[0], now)
+
 
 class Progress(NamedTuple):
     """How far an order is.

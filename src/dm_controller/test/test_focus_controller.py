@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from array import array
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from copy import copy
@@ -137,6 +138,7 @@ class Bench:
         self.history_known, self.obeys = False, True
         self.state = ActuatorState.STATE_ACTIVE
         self.holder = ""
+        self.unused = np.zeros(ACTUATORS, dtype=bool)  # without a channel: they rest at -1
         self.commands: list[SendCommand] = []
         self.outcomes: list[Order] = []  # as they were when they were published
         self.degauss_runs: list[StartDegauss] = []
@@ -177,7 +179,8 @@ class Bench:
         report = ActuatorState(
             driver_state=self.state,
             sequence=self.sequence,
-            applied=doubles(self.signals),
+            applied=doubles(np.where(self.unused, -1.0, self.signals)),
+            flags=array("B", np.where(self.unused, ActuatorState.FLAG_UNUSED, 0).astype(np.uint8).tobytes()),
             requested=doubles(self.requested),
             turns=self.turns,
             turned_at=doubles(self.turned_at),
@@ -377,6 +380,30 @@ def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its
     assert not list(asked)
     host._started -= START_S
     FocusHost.await_start(host)  # it asks no more
+
+
+def test_actuators_without_a_channel_are_neither_corrected_nor_kept_where_they_rest(bench: Bench) -> None:
+    bench.unused[-1] = True
+    bench.degauss()
+    order = bench.ask(0.03)
+    assert bench.controller.monitor.progress(order, bench.time).stands
+    bench.wait(60.0)
+    assert len(bench.commands) > 2 and bench.controller.hold.active
+    first, *corrections = [command.signals for command in bench.commands]
+    assert max(np.abs(signals - first).max() for signals in corrections) < 0.2
+    bench.do(bench.controller.stop(order, bench.now) or [])
+    np.testing.assert_allclose(bench.commands[-1].signals, corrections[-1], atol=1e-9)
+
+
+def test_a_cancelled_move_is_left_inside_the_limits(bench: Bench) -> None:
+    """Written as codes, neighbours may differ by a step more than they may be told to."""
+    order = bench.ask(0.03)
+    reached = np.where(np.arange(ACTUATORS) == 0, 1.0 + 1.5e-5, bench.signals)
+    bench.signals = reached
+    bench.report(moving=True)
+    bench.do(bench.controller.stop(order, bench.now) or [])
+    assert bench.commands[-1].signals.max() <= 1.0
+    np.testing.assert_allclose(bench.commands[-1].signals, reached, atol=1e-4)
 
 
 def test_the_newest_request_wins(bench: Bench) -> None:

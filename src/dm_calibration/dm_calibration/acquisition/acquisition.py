@@ -218,6 +218,8 @@ class Acquisition:
         finally:
             with self._handover:
                 self._waiting = None
+            while not arrivals.empty():  # the trigger failed, or the time was up
+                self._on_file(arrivals.get())
 
     def _next_file(
         self, watch: FolderWatch, arrivals: queue.SimpleQueue[Path], deadline: float

@@ -22,7 +22,7 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
         reference = read_map(Path(path).expanduser(), xyz_unit=xyz_unit or None)
     except MapFileError as error:
         raise ValueError(f"reference_surface: {error}") from error
-    if wavelength and abs(reference.wavelength - wavelength) > tolerance:
+    if wavelength and reference.wavelength and abs(reference.wavelength - wavelength) > tolerance:
         raise ValueError(
             f"reference_surface = {path!r}: wavelength {reference.wavelength * 1e9:.3f} nm, must be "
             f"{wavelength * 1e9:.3f} nm as the instrument's (wavelength.expected)"
@@ -58,7 +58,7 @@ def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavele
         different = f"{size.format(*here)}, reference_surface has {size.format(*there)}"
     elif all(pitches) and abs(pitches[0] - pitches[1]) > PITCH_TOLERANCE * pitches[1]:
         different = f"pitch {pitches[0] * 1e6:.3f} um, reference_surface has {pitches[1] * 1e6:.3f} um"
-    elif abs(source.wavelength - reference.wavelength) > wavelength_tolerance:
+    elif reference.wavelength and abs(source.wavelength - reference.wavelength) > wavelength_tolerance:
         different = (
             f"wavelength {source.wavelength * 1e9:.3f} nm, reference_surface has {reference.wavelength * 1e9:.3f} nm"
         )

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.outcome import Doubted, Dropped, Event, MapTaken, Segment, Setup, Solved, Unseen
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
@@ -37,8 +36,9 @@ class Storing:
 _EVENTS: dict[str, Any] = {
     kind.__name__: kind for kind in (Setup, Segment, MapTaken, Unseen, Dropped, Solved, Doubted, Storing)
 }
-#: What a frame keeps of a map; the points stand in Setup, and what all maps share too.
-_RECORD = MapSet.columns()
+#: What all maps share stands in Setup; the frame of a map keeps the rest.
+_SHARED = [shared.name for shared in fields(Setup)]
+_RECORD = [own.name for own in fields(Measurement) if own.name not in _SHARED]
 
 #: The seal that the first frame of a run follows.
 FIRST = b"\0" * _SEAL
@@ -60,7 +60,7 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
     Raises:
         ValueError: a frame is whole but of another version.
     """
-    seal, position, points = FIRST, 0, None
+    seal, position, setup = FIRST, 0, None
     start = len(_MARK) + _LENGTHS.size
     while len(content) - position >= start + _SEAL and content[position : position + len(_MARK)] == _MARK:
         head, payload = _LENGTHS.unpack_from(content, position + len(_MARK))
@@ -71,21 +71,21 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
         if hashlib.sha256(seal + content[position:end]).digest() != found:
             return
         text = content[position + start : position + start + head]
-        event = _event(json.loads(text), memoryview(content)[position + start + head : end], points)
+        event = _event(json.loads(text), memoryview(content)[position + start + head : end], setup)
         if isinstance(event, Setup):
-            points = event.points
+            setup = event
         position, seal = end + _SEAL, found
         yield event, position, seal
 
 
-def _event(head: dict[str, Any], payload: memoryview, points: SamplePoints | None) -> Event | Storing:
-    """The event in a frame; its map, if it has one, was sampled at `points`."""
+def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Event | Storing:
+    """The event in a frame; its map, if it has one, was taken with `setup`."""
     try:
         values = _rebuilt(head["fields"], payload)
         if "record" in values:
-            if points is None:
+            if setup is None:
                 raise KeyError("points")
-            values["record"] = Measurement(points=points, **values["record"])
+            values["record"] = Measurement(**{name: getattr(setup, name) for name in _SHARED} | values["record"])
         if "points" in values:
             values["points"] = SamplePoints(**values["points"])
         event: Event | Storing = _EVENTS[head["event"]](**values)

@@ -120,15 +120,20 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
 
     Raises:
         UnknownNameError: a surface that Table 1 does not have, naming the near ones.
-        ValueError: a surface asked for by name that this mirror cannot have, or an option out of its range.
+        ValueError: a surface asked for by name that this mirror cannot have, or the plan does not measure, or an option
+            out of its range.
         TooFewMapsError: too few maps to find the hysteresis of so many actuators.
     """
     options = options or PlanOptions()
+    names = surfaces.check_names(options.surfaces)
+    if options.surfaces and kind not in (PlanKind.FULL, PlanKind.SURFACES):
+        raise ValueError(
+            f"surfaces = {', '.join(options.surfaces)}: the plan {kind.name.lower()} measures none of them"
+        )
     if kind is PlanKind.HYSTERESIS:
         return _hysteresis_plan(mirror, options)
     remarks: list[str] = []
     states: list[Step] = []
-    names = surfaces.check_names(options.surfaces)
     if kind is not PlanKind.SURFACES:
         states += _pokes(mirror, options.poke_amplitude, remarks)
     if kind in (PlanKind.FULL, PlanKind.SURFACES):

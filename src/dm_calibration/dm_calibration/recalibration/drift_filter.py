@@ -84,6 +84,7 @@ class DriftFilter:
     Args:
         calibration: its maps show how far a map scatters about its prediction.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
+        rates: how fast a mirror drifts; `options` holds both.
 
     Raises:
         ValueError: the maps of a hysteresis model have time stamps that run backwards.
@@ -91,7 +92,7 @@ class DriftFilter:
 
     def __init__(self, calibration: Calibration, signal_sigma: float, rates: DriftRates) -> None:
         fit, maps, hysteresis = calibration.fit, calibration.maps, calibration.hysteresis
-        self._fit = fit
+        self._fit, self.options = fit, (signal_sigma, rates)
         self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
         self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
         self._visible = visible_gain(self._gain, self.reduction, calibration)

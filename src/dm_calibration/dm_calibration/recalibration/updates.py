@@ -181,7 +181,7 @@ class RecalibrationManager:
                 )
             repeat = _repeats(kept, measured.stamp_ns, settled)
             if without:
-                updates = kept.filter.give_up(updates, list(without), measured, settled.effective, repeat)
+                updates = kept.filter.give_up(updates, sorted(set(without)), measured, settled.effective, repeat)
             comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
@@ -226,9 +226,12 @@ class RecalibrationManager:
             self.in_use = InUse(kept.calibration, kept.filter, kept.basis, fresh)
 
     def _kept(self) -> InUse:
-        if self.in_use is None:
+        if (kept := self.in_use) is None:
             raise MapNotUsableError("no calibration is in use")
-        return self.in_use
+        options = self._options()
+        if kept.filter.options != (made_with := (options.signal_sigma, options.rates)):  # parameters that are live
+            kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, *made_with))
+        return kept
 
     def _file(self, identifier: str, suffix: str = SUFFIX) -> Path:
         return self.folder / f"{identifier}{suffix}"
@@ -260,6 +263,12 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
         raise MapNotUsableError(
             f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
             f"{calibration.wavelength * 1e9:.3f} nm (0 = not known)"
+        )
+    subtracted = measured.system_error_subtracted, calibration.system_error_subtracted
+    if -1 not in subtracted and subtracted[0] != subtracted[1]:
+        raise MapNotUsableError(
+            f"system_error_subtracted = {subtracted[0]}, in the calibration's maps {subtracted[1]} (1 = the instrument "
+            "had subtracted its own error): set the instrument as it was"
         )
     if measured.reference_surface != calibration.reference_surface:
         raise MapNotUsableError(

@@ -5,14 +5,15 @@ picture of every actuator.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
+from dm_calibration.calibration import Calibration
 from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
-from dm_calibration.report.checks import valid_until
+from dm_calibration.report.checks import DEFAULTS, valid_until
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
@@ -85,7 +86,7 @@ def certificate(
     calibration: Calibration,
     names: Mapping[str, str],
     checks: Sequence[Check] = (),
-    error_max: float = CALIBRATED_ERROR_MAX,
+    values: Mapping[str, Any] = DEFAULTS,
     since: Sequence[str] = (),
 ) -> Section:
     """Verdict, range, promise, term and names.
@@ -93,13 +94,13 @@ def certificate(
     Args:
         names: of `operator` and `instrument`.
         checks: since then, oldest first.
-        error_max: m that a calibrated mirror promises.
+        values: of the parameters JUDGED_BY.
         since: what checks have shown that it holds no more, or in part only: sentences.
     """
-    reasons = [*calibration.doubts(error_max), *(sentence.rstrip(".") for sentence in since)]
+    reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]
     bound = length(calibration.promise, calibration.wavelength)
     low, high = curvatures(calibration)
-    until, reason = valid_until(checks, calibration.promise, calibration.created_ns * 1e-9)
+    until, reason = valid_until(checks, calibration.promise, calibration.created_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0

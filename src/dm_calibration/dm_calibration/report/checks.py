@@ -1,6 +1,7 @@
 """Text of the report: what checks have shown since the calibration, what drifts, how fast, until when it is valid."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,10 +18,14 @@ DAY_S = 86400.0
 TREND_MIN, TREND_SPAN_S = 5, DAY_S
 #: Checks in the table: the last ones.
 SHOWN = 20
-DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+#: Parameters of the node `calibration` that a report judges by.
+JUDGED_BY = ("calibrated_error_max", "updates.stale_after", "updates.surprises_max")
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS if parameter.name in JUDGED_BY}
 
 
-def valid_until(checks: Sequence[Check], promised: float, created_s: float) -> tuple[float, str]:
+def valid_until(
+    checks: Sequence[Check], promised: float, created_s: float, values: Mapping[str, Any] = DEFAULTS
+) -> tuple[float, str]:
     """Until when a calibration is valid, s since the epoch, and why; the next is to be made by then.
 
     The trend is the median of all slopes between two checks; it counts where its 90 % interval is above zero.
@@ -29,9 +34,10 @@ def valid_until(checks: Sequence[Check], promised: float, created_s: float) -> t
         checks: oldest first.
         promised: 95 % bound on the largest coefficient error, m.
         created_s: when the calibration was made.
+        values: of the parameters JUDGED_BY.
     """
     agreed = [check.time for check in checks if check.accepted]
-    stale = max([created_s, *agreed]) + DEFAULTS["updates.stale_after"]
+    stale = max([created_s, *agreed]) + values["updates.stale_after"]
     if len(checks) < TREND_MIN or checks[-1].time - checks[0].time < TREND_SPAN_S:
         return stale, "too few checks to see a trend; a check that agrees puts it off"
     time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
@@ -43,15 +49,16 @@ def valid_until(checks: Sequence[Check], promised: float, created_s: float) -> t
     return min(stale, max(reached, float(time[-1]))), f"the error grows by {per_month} and reaches the promise then"
 
 
-def checks_section(calibration: Calibration, checks: Sequence[Check]) -> Section:
+def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = DEFAULTS) -> Section:
     """Table, chart and a sentence on each question.
 
     Args:
         checks: at least one, oldest first.
+        values: of the parameters JUDGED_BY.
     """
     last, created, promised = checks[-1], calibration.created_ns * 1e-9, calibration.promise
     days = max(last.time - created, 1.0) / DAY_S
-    until, reason = valid_until(checks, promised, created)
+    until, reason = valid_until(checks, promised, created, values)
     outside = sum(check.max_zernike > promised for check in checks)
     sentences = [
         f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "

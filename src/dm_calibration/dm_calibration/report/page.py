@@ -1,12 +1,13 @@
 """The report: all sections in order, as one HTML file and one PDF file."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
+from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
@@ -27,25 +28,27 @@ class Written(NamedTuple):
 
 
 def sections(
-    calibration: Calibration, file: Path | None = None, error_max: float = CALIBRATED_ERROR_MAX
+    calibration: Calibration, file: Path | None = None, values: Mapping[str, Any] = checks.DEFAULTS
 ) -> list[Section]:
-    """All sections of the report of `calibration`, which was read from `file`; `error_max` as of a certificate.
+    """All sections of the report of `calibration`, which was read from `file`; `values` of what it is judged by.
 
     Raises:
         OSError: `file` cannot be read.
     """
     left, since = residuals(calibration), list[str]()
     if file is not None:
-        updates = RecalibrationManager(file.parent, UpdateOptions)
+        updates = RecalibrationManager(
+            file.parent, lambda: UpdateOptions(surprises_max=values["updates.surprises_max"])
+        )
         updates.begin(calibration)
         since = updates.doubts
     log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
-        certificate.certificate(calibration, certificate.people(), log, error_max, since),
+        certificate.certificate(calibration, certificate.people(), log, values, since),
         certificate.every_actuator(calibration),
         Section("Appendix", ["What the two pages before rest on."]),
-        *([checks.checks_section(calibration, log)] if log else []),
+        *([checks.checks_section(calibration, log, values)] if log else []),
         content.summary(calibration),
         content.provenance(calibration),
         content.cautions(calibration),
@@ -61,18 +64,18 @@ def sections(
 
 
 def write_report(
-    calibration: Calibration, folder: Path, file: Path | None = None, error_max: float = CALIBRATED_ERROR_MAX
+    calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = checks.DEFAULTS
 ) -> Written:
     """Write ``<id>.html`` and ``<id>.pdf`` into `folder`; each is there whole or not at all.
 
     Args:
         file: that the calibration was read from, for its SHA-256.
-        error_max: m that a calibrated mirror promises.
+        values: of the parameters that it is judged by, `checks.JUDGED_BY`.
 
     Raises:
         OSError: `file` cannot be read, or `folder` not written to.
     """
-    made = sections(calibration, file, error_max)
+    made = sections(calibration, file, values)
     title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
     written = Written(folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf")
     write_whole(written.html, html_page(title, made).encode())

@@ -5,15 +5,17 @@ goes wrong with it, the calibration is stored already. `./dm report` writes the 
 """
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
-from dm_calibration.calibration import CALIBRATED_ERROR_MAX
+from dm_calibration.report.checks import DEFAULTS, JUDGED_BY
 from dm_calibration.store.calibration_store import CalibrationStore
 
 #: Longest time for one report, s of wall time; a loaded machine may need a multiple of the usual few.
@@ -27,13 +29,11 @@ class ReportWriter:
 
     Args:
         publish: called with a sentence and whether it is a warning, from a thread of its own.
-        error_max: m that a calibrated mirror promises now.
+        values: of the node's parameters; those of JUDGED_BY count as they are when a report is begun.
     """
 
-    def __init__(
-        self, publish: Callable[[str, bool], None], error_max: Callable[[], float] = lambda: CALIBRATED_ERROR_MAX
-    ) -> None:
-        self._publish, self._error_max = publish, error_max
+    def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = DEFAULTS) -> None:
+        self._publish, self._values = publish, values
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reports")
         self._waiting: set[Path] = set()
@@ -68,7 +68,7 @@ class ReportWriter:
             try:
                 command = [sys.executable, "-m", "dm_calibration.report.report_writer", str(file)]
                 self._process = subprocess.Popen(
-                    [*command, str(self._error_max())],
+                    [*command, json.dumps({name: self._values[name] for name in JUDGED_BY})],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
@@ -100,15 +100,15 @@ class ReportWriter:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the report of the calibration file named in `arguments`, and judged by the number behind, m, beside it;
-    returns the exit status.
+    """Write the report of the calibration file named in `arguments` beside it, judged by the parameters behind, in
+    JSON; returns the exit status.
     """
     from dm_calibration.report.page import write_report
 
     os.nice(NICENESS)
     file = Path(arguments[0])
     try:
-        write_report(CalibrationStore(file.parent).load(file.name), file.parent, file, float(arguments[1]))
+        write_report(CalibrationStore(file.parent).load(file.name), file.parent, file, json.loads(arguments[1]))
     except (OSError, ValueError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1

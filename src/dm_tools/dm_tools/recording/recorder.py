@@ -36,13 +36,16 @@ IDLE_S = 1.0
 #: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
 MAP_TOPIC = "surface_map"
 
+#: Topics that all mirrors of a domain share.
+COMMON = ("/diagnostics", "/rosout", "/clock", "/tf", "/tf_static", PARAMETER_EVENTS)
+
 
 class Recorder:
     """Records until it is closed. Use as a context manager.
 
     Args:
         folder: of the new recording.
-        namespace: record only topics in it; "" = all.
+        namespace: record only topics in it, and those that all share; "" = all.
         topics: only these, by their names with or without namespace; empty = all.
         maps: whether to record the maps themselves.
         domain: ROS domain; None = the environment's.
@@ -135,7 +138,7 @@ class Recorder:
             return name in self._wanted or name == PARAMETER_EVENTS
         if name.rsplit("/", 1)[-1] == MAP_TOPIC and not self._maps:
             return False
-        inside = name.startswith(self._namespace) or name.count("/") == 1  # /diagnostics, /rosout, /clock belong to all
+        inside = name.startswith(self._namespace) or name in COMMON
         return inside and not re.search(r"/_(?!action/(feedback|status)$)", name)
 
     def _subscribe(self, name: str, type_name: str) -> None:

@@ -213,6 +213,10 @@ def calibrate(
     if (hysteresis is not None or until) and plan != CalibrationPlan.hysteresis:
         option = "--until" if until else "--hysteresis"
         raise typer.BadParameter(f"--plan {plan.value} and {option}: must be the plan hysteresis, which alone has that")
+    if amplitude and plan in (CalibrationPlan.hysteresis, CalibrationPlan.surfaces):
+        raise typer.BadParameter(
+            f"--plan {plan.value} and --amplitude: must be a plan with pokes, such as --plan pokes"
+        )
     goal = Calibrate.Goal(
         plan=plan.name,
         hysteresis_maps=hysteresis or 0,

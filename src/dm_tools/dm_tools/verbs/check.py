@@ -34,6 +34,8 @@ def check(
         list[int] | None,
         typer.Option(
             metavar="NUMBER",
+            min=1,
+            max=65535,
             help="Go on without this actuator, which does not move any more; repeatable. --forget takes it back.",
         ),
     ] = None,

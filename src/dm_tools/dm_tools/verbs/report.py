@@ -15,24 +15,26 @@ from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, ne
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 
 
-def running_calibration(namespace: str) -> tuple[Path | None, float]:
-    """File of the calibration that the running suite uses, and what a calibrated mirror promises there, m.
+def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any]]:
+    """File of the calibration that the running suite uses, and the parameters that a report is judged by there.
 
-    No file: nothing runs, it has none, or it runs elsewhere.
+    No file: it has none, or runs elsewhere. The parameters as they are by default: nothing runs.
     """
-    from dm_calibration.calibration import CALIBRATED_ERROR_MAX
+    from dm_calibration.report.checks import DEFAULTS, JUDGED_BY
     from dm_client import DeformableMirrorClient
     from dm_tools.parameter_changes import get_parameter
     from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
-        if client.wait(lambda: nodes_of_suite(client), FIND_S):
-            client.wait(lambda: "calibration" in client.messages, BUSY_S)
+        if not client.wait(lambda: nodes_of_suite(client), FIND_S):
+            return None, DEFAULTS
+        client.wait(lambda: "calibration" in client.messages, BUSY_S)
         message = client.messages.get("calibration")
-        file = Path(message.file if message is not None else "")
-        if not (file.name and file.is_file()):
-            return None, CALIBRATED_ERROR_MAX
-        return file, float(get_parameter(client, "calibration", "calibrated_error_max"))
+        if message is None:
+            return None, DEFAULTS
+        values = {name: get_parameter(client, "calibration", name) for name in JUDGED_BY}
+        file = Path(message.file)
+        return file if message.file and file.is_file() else None, values
 
 
 def newest_store(folders: Sequence[Path]) -> Path:
@@ -94,9 +96,8 @@ def report(
 ) -> None:
     """Write the report of a calibration: what was measured with what, how good it is, and what limits it.
 
-    Reads the stored file; needs no running nodes, but takes the calibration of those that run.
+    Reads the stored file; needs no running nodes, but judges by the parameters of those that run.
     """
-    from dm_calibration.calibration import CALIBRATED_ERROR_MAX
     from dm_calibration.report.certificate import keep_people, people
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
@@ -105,11 +106,9 @@ def report(
     folder = out.resolve()
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
-    error_max = CALIBRATED_ERROR_MAX
+    file_in_use, values = running_calibration(namespace)
     if store is None:
-        if not calibration:
-            file_in_use, error_max = running_calibration(namespace)
-            calibration = str(file_in_use or "")
+        calibration = calibration or str(file_in_use or "")
         store = folder_with(calibration, STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
@@ -117,7 +116,7 @@ def report(
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
             names[name] = typer.prompt(f"{name}, for the first page (Enter = none)", default="", show_default=False)
     keep_people(names)
-    written = write_report(found, folder, file, error_max)
+    written = write_report(found, folder, file, values)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
         f"{len(found.limitations)} known limitations"
