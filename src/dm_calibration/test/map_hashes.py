@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,14 @@ def map_hashes(maps: MapSet) -> list[str]:
 
 
 def record_hash(record: Measurement) -> str:
-    """The same of one map."""
-    digest = hashlib.sha256()
+    """The same of one map; of maps stored long ago, too (`stored/`)."""
+    head: dict[str, Any] = {}
+    arrays = b""
     for name in MapSet.columns():
         value = getattr(record, name)
-        digest.update(name.encode() + (value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()))
-    return digest.hexdigest()
+        if isinstance(value, np.ndarray):
+            head[name] = {"shape": value.shape, "at": len(arrays)}
+            arrays += value.astype("<f8").tobytes()
+        elif name != "temperature" or not np.isnan(value):
+            head[name] = value
+    return hashlib.sha256(json.dumps(head).encode() + arrays).hexdigest()

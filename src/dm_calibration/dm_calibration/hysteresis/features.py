@@ -1,6 +1,7 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
 from collections.abc import Iterator
+from inspect import signature
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
@@ -17,6 +18,8 @@ RATE_MIN = 1e-3
 
 #: Residual of the solved weights, relative: effective signals are within 1e-7 then.
 SOLVED = 1e-7
+#: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
+_RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Patterns that are kept of the prior.
 PATTERNS = 60
 #: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
@@ -240,5 +243,6 @@ def weights_of(features: Floats, left: Floats, gains: Floats, root: Floats, betw
     right = (rows @ (gains @ left.T)[..., None]).ravel()
     shape = (right.size, right.size)
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
-    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, rtol=SOLVED, M=preconditioner)
+    tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
+    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, M=preconditioner, **tolerance)
     return np.asarray(root @ unknown.reshape(actuators, count).T)

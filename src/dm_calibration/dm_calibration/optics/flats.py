@@ -98,7 +98,8 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         squares += apart
         if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
             judged += apart
-            freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
+            sizes = np.linalg.svd(matrix, compute_uv=False)
+            freedom += (2 if m else 1) * len(tests) - int((sizes > DETERMINED * sizes[0]).sum())
         worst = max(worst, *np.linalg.norm(inverse[: len(determined)], axis=1)[determined], 0.0)
         if not determined.all():
             open_orders.add(m)
