@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 GENERATION = ROOT / "runs" / "apt-generation"
-CURE = f"./dm exec python -m pip install --no-deps --target {GENERATION.relative_to(ROOT)} -r requirements/apt-generation.txt"
+CURE = "./dm exec python -m pip install --no-deps --target runs/apt-generation -r requirements/apt-generation.txt"
 #: Without nodes: the hysteresis fit, what plans a move, and what else is computed of maps.
 TESTED = (
     "tests/hysteresis/test_hysteresis_fit.py",

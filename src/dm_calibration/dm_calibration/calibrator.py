@@ -202,6 +202,8 @@ def refit(
     fit = fit_effective(stored.maps, stored.hysteresis, options, mirror, exclude)
     of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
     without = f" without {', '.join(exclude)}" if exclude else ""
+    if exclude and stored.hysteresis is not None:
+        without += "; the hysteresis model, and the promise, are those of all its maps"
     return replace(
         stored,
         id=provenance.id,

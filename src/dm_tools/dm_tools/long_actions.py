@@ -47,6 +47,7 @@ class ExternalGoals:
         self._own: set[bytes] = set()
         self._ended: set[bytes] = set()
         self._heard = 0.0
+        self._servers: set[bytes] = set()  # who has it, since the goal began
         self.goals = 0
         self.feedback: Any = None
         self.residuals: list[float] = []
@@ -72,7 +73,13 @@ class ExternalGoals:
             running, heard = self._running, self._heard
             if not running or running in self._own or time.monotonic() - heard > SILENCE_S:
                 return False
-        return bool(self._node.count_publishers(self._status_topic))
+        known = self._node.get_publishers_info_by_topic(self._status_topic)
+        there = {bytes(server.endpoint_gid) for server in known}
+        with self._lock:
+            self._servers = self._servers or there
+            if not self._servers & there:  # its node has died; one that was started again says nothing of its goals
+                self._running = b""
+            return bool(self._running)
 
     def cancel(self) -> Future | None:
         """Ask the goal that runs to stop: the answer, None = no goal runs. Its status says when it has stopped."""
@@ -107,7 +114,7 @@ class ExternalGoals:
             self.feedback, self._heard = feedback, time.monotonic()
 
     def _begin(self, identity: bytes) -> None:
-        self._running, self.feedback = identity, None
+        self._running, self.feedback, self._servers = identity, None, set()
         self.goals += 1
 
 

@@ -109,7 +109,7 @@ class FakeNode:
 
     def __init__(self) -> None:
         self.callbacks: dict[str, Any] = {}
-        self.publishers = 1
+        self.servers = ["first"]
 
     def create_subscription(self, _kind: Any, topic: str, callback: Any, _qos: Any) -> None:
         self.callbacks[topic] = callback
@@ -117,8 +117,8 @@ class FakeNode:
     def create_client(self, _kind: Any, _name: str) -> Any:
         return SimpleNamespace(call_async=lambda request: setattr(self, "asked", request))
 
-    def count_publishers(self, _topic: str) -> int:
-        return self.publishers
+    def get_publishers_info_by_topic(self, _topic: str) -> list[Any]:
+        return [SimpleNamespace(endpoint_gid=name.encode()) for name in self.servers]
 
 
 class Goal:

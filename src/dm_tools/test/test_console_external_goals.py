@@ -39,8 +39,20 @@ def test_a_goal_whose_node_has_gone_has_ended() -> None:
     watch, node = watched()
     Goal(node, 3).tell(EXECUTING)
     assert watch.running
-    node.publishers = 0
+    node.servers = []
     assert not watch.running
+
+
+def test_a_node_that_was_started_again_knows_nothing_of_the_goals_of_before() -> None:
+    watch, node = watched()
+    Goal(node, 3).tell(EXECUTING)
+    assert watch.running
+    node.servers = ["first", "second"]  # who was killed is forgotten later
+    assert watch.running
+    node.servers = ["second"]
+    assert not watch.running and watch.cancel() is None
+    Goal(node, 4).tell(EXECUTING)
+    assert watch.running
 
 
 def test_residuals_stay_until_the_next_run_tells_its_first() -> None:

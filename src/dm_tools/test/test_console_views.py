@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from dm_msgs.msg import (
     ActuatorEstimate,
     ActuatorState,
@@ -35,7 +35,7 @@ from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
 from dm_tools.console.charts.plots import INK, SAG_COLOURS, heat_map, loop_chart, residual_chart, zernike_chart
-from dm_tools.console.console_node import Snapshot
+from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import SHOWN_S, Session
 from dm_tools.console.state_observer import StateObserver
@@ -43,6 +43,8 @@ from dm_tools.console.style import CSS
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.running_suite import NEEDED
 from dm_tools.verify import map_of
+from ros_fixtures import Observer
+from waiting import wait_until
 
 COUNT = 7
 RADIUS = 11e-3
@@ -175,20 +177,20 @@ def test_what_is_missing_is_told_with_its_effect() -> None:
 
 
 def test_a_button_tells_why_it_cannot_be_pressed() -> None:
-    everything = frozenset(NEEDED)
-    active = Snapshot(actuator_state=state([0.0] * COUNT), present=everything)
+    everything = dict.fromkeys(NEEDED, DiagnosticStatus())
+    active = Snapshot(actuator_state=state([0.0] * COUNT), health=everything)
     assert status.reason_against("move", active, "") == ""
     assert status.reason_against("move", active, "Calibration") == "Calibration is under way."
     assert "not calibrated" in status.reason_against("focus", active, "")
     calibrated = Snapshot(
-        actuator_state=active.actuator_state, capabilities=Capabilities(calibration_id="c1"), present=everything
+        actuator_state=active.actuator_state, capabilities=Capabilities(calibration_id="c1"), health=everything
     )
     assert status.reason_against("focus", calibrated, "") == ""
     lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST, message="no route to 10.0.0.7")
-    assert status.reason_against("move", Snapshot(actuator_state=lost, present=everything), "") == (
+    assert status.reason_against("move", Snapshot(actuator_state=lost, health=everything), "") == (
         "The driver is link lost: no route to 10.0.0.7."
     )
-    assert status.reason_against("measure", Snapshot(present=frozenset({"pdm_driver"})), "") == (
+    assert status.reason_against("measure", Snapshot(health={"pdm_driver": DiagnosticStatus()}), "") == (
         "The node interferometer is not heard."
     )
 
@@ -200,7 +202,7 @@ def test_badges_warn_of_an_unknown_history() -> None:
         mirror_info=mirror_info(),
         actuator_state=state([0.0] * COUNT),
         calibration=message,
-        present=frozenset({"pdm_driver"}),
+        health={"pdm_driver": DiagnosticStatus()},
     )
     assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
     assert status.Badge("history: known") in status.badges(snapshot, "")
@@ -236,13 +238,35 @@ def test_messages_have_their_time_and_the_log_keeps_them(monkeypatch: pytest.Mon
 def test_the_page_says_where_the_mirror_stands() -> None:
     values = {"curvature": 0.05, "age": "40.0", "bound": 1.3e-9, "held": False}
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    heard = {"left/focus_controller": DiagnosticStatus(name="left/focus_controller", values=pairs)}
-    present = frozenset(("pdm_driver", "focus_controller"))
-    snapshot = Snapshot(actuator_state=ActuatorState(), diagnostics=heard, present=present)
+    heard = {"pdm_driver": DiagnosticStatus(), "focus_controller": DiagnosticStatus(values=pairs)}
+    snapshot = Snapshot(actuator_state=ActuatorState(), health=heard)
     assert status.now_text(snapshot) == "now: +0.0500 1/m for 40 s, within 1.3 nm (95 %)"
     assert status.now_text(replace(snapshot, actuator_state=ActuatorState(moving=True))) == "now: moving"
-    assert "not at a curvature" in status.now_text(replace(snapshot, diagnostics={}))
+    silent = replace(snapshot, health=dict.fromkeys(heard, DiagnosticStatus()))
+    assert "not at a curvature" in status.now_text(silent)
     assert "not heard" in status.now_text(Snapshot())
+
+
+@pytest.mark.parametrize(("namespace", "own"), [("left", "left/"), ("", "")])
+def test_the_nodes_of_another_mirror_are_not_taken_for_those_of_this_one(
+    observer: Observer, domain: int, namespace: str, own: str
+) -> None:
+    node = ConsoleNode(namespace, domain)
+    publisher = observer.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    names = ("left/focus_controller", "right/pdm_driver", "pdm_driver", "left/calibration", "interferometer")
+    statuses = [DiagnosticStatus(name=name, message=name) for name in names]
+
+    def heard() -> bool:
+        publisher.publish(DiagnosticArray(status=statuses))
+        return len(node.snapshot().diagnostics) == len(names)
+
+    try:
+        wait_until(heard, 30.0)
+        health = node.snapshot().health
+    finally:
+        node.close()
+    of_it = [name.removeprefix(own) for name in names if name.rpartition("/")[0] == namespace]
+    assert {name: status.message for name, status in health.items()} == {name: own + name for name in of_it}
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ class Snapshot:
     Attributes:
         calibration: in use; None = none is, or none was heard.
         diagnostics: {node: latest status}, of this namespace's nodes and others.
-        present: names of the nodes heard lately, without the namespace.
+        health: the same of the nodes of this namespace that were heard lately, by their names without it.
         bench_time: s, ROS time as far as heard.
     """
 
@@ -69,8 +69,13 @@ class Snapshot:
     surface_map_info: Any = None
     zernike: Any = None
     diagnostics: dict[str, DiagnosticStatus] = field(default_factory=dict)
-    present: frozenset[str] = frozenset()
+    health: dict[str, DiagnosticStatus] = field(default_factory=dict)
     bench_time: float = 0.0
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Names of the nodes heard lately, without the namespace."""
+        return frozenset(self.health)
 
 
 class ConsoleNode:
@@ -125,18 +130,19 @@ class ConsoleNode:
     def snapshot(self) -> Snapshot:
         """What is known now."""
         recent, diagnostics = time.monotonic() - SILENCE_S, dict(self._diagnostics)
-        present = frozenset(
-            name.removeprefix(self._prefix)
-            for name, (_status, when) in diagnostics.items()
-            if when >= recent and name.startswith(self._prefix)
-        )
+        place = self._prefix.rstrip("/")
+        health = {
+            name.rpartition("/")[2]: status
+            for name, (status, when) in diagnostics.items()
+            if when >= recent and name.rpartition("/")[0] == place
+        }
         messages = dict(self._connection.messages)
         if "calibration" in messages and not messages["calibration"].id:
             del messages["calibration"]
         return Snapshot(
             **messages,
             diagnostics={name: status for name, (status, _when) in diagnostics.items()},
-            present=present,
+            health=health,
             bench_time=self._bench_time,
         )
 

@@ -167,7 +167,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
         await session.ros.call("set_signals", SetSignals.Request(signals=start, wait=True), MOVE_S)
         raise
     loop = modelled_loop(observer.law, actuator, mirror.signal_min, mirror.signal_max)
-    session.loops[actuator] = dataclasses.replace(
+    session.loops[calibration.id, actuator] = dataclasses.replace(
         loop, path=tuple(signals), modelled_path=tuple(model), measured=tuple(values)
     )
     gap = float(np.abs(np.array(values) - np.array(model)).max())

@@ -76,7 +76,7 @@ class Session:
         chosen: number of the actuator that is shown.
         base: signals to go back to when a poke is released; None = nothing is poked.
         poked: signals of the last poke.
-        loops: {actuator: measured loop}.
+        loops: {(id of the calibration, actuator): measured loop}.
     """
 
     ros: ConsoleNode
@@ -86,7 +86,7 @@ class Session:
     chosen: int = 1
     base: list[float] | None = None
     poked: list[float] = field(default_factory=list)
-    loops: dict[int, Loop] = field(default_factory=dict)
+    loops: dict[tuple[str, int], Loop] = field(default_factory=dict)
     _outcome_ends: float = 0.0
     _cancel: str | None = None
     _task: asyncio.Task[None] | None = None

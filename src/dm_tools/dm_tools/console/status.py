@@ -62,7 +62,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
         )
         if calibration.hysteresis.play_radius:
             shown.append(Badge("history: not known", "doubt") if doubt else Badge("history: known"))
-    worst = max((ord(bytes(status.level)) for status in snapshot.diagnostics.values()), default=0)
+    worst = max((ord(bytes(status.level)) for status in snapshot.health.values()), default=0)
     if worst and worst != ord(DiagnosticStatus.STALE):
         text = LEVELS.get(bytes([worst]), "?")
         shown.append(Badge(f"diagnostics: {text}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
@@ -137,14 +137,13 @@ def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> li
 
 def now_text(snapshot: Any) -> str:
     """Where the mirror stands, in one line."""
-    names = {name.rpartition("/")[2]: status for name, status in snapshot.diagnostics.items()}
     state = snapshot.actuator_state
     for name in ("pdm_driver", "focus_controller"):
         if name not in snapshot.present or state is None:
             return f"now: not known, {name} is not heard"
     if state.moving:
         return "now: moving"
-    if (shape := settled_shape(names)) is None:
+    if (shape := settled_shape(snapshot.health)) is None:
         return "now: not at a curvature that was asked for"
     return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {in_nanometres(shape.bound)} (95 %)" + (
         ", held" if shape.held else ""

@@ -138,7 +138,7 @@ class ActuatorCards:
         signal, stands = self._cells[session.chosen - 1].signal, None
         if settled.effective is not None and signal is not None:
             stands = (signal, round(float(settled.effective[session.chosen - 1]), 4))
-        measured = session.loops.get(session.chosen)
+        measured = session.loops.get((calibration.id, session.chosen))
         key = (session.chosen, calibration.id, stands, id(measured))
         if key == self._loop:
             return

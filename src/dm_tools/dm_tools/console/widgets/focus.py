@@ -1,11 +1,12 @@
 """The card that asks for a curvature."""
 
+import asyncio
 import math
 
 from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
@@ -15,6 +16,8 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
+#: Refusals of a prediction that say nothing of the wish, which is tried again after so long, s.
+PASSING, AGAIN_S = (ErrorCode.TIMEOUT, ErrorCode.BUSY, ErrorCode.DRIVER_UNAVAILABLE), 2.0
 
 
 class FocusCard:
@@ -81,11 +84,12 @@ class FocusCard:
             background_tasks.create(self._predict())
 
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
-        """Calibration, recipes, whether the history is known, and what runs: at its end the mirror may have moved."""
-        identity = snapshot.capabilities.calibration_id if snapshot.capabilities is not None else ""
-        recipes = len(snapshot.recipes.recipes) if snapshot.recipes is not None else 0
-        known = snapshot.actuator_state is not None and snapshot.actuator_state.history_known
-        return identity, recipes, known, self._session.running
+        """What is promised, recipes, where the mirror stands, whether its history is known, and what runs."""
+        able, state, book = snapshot.capabilities, snapshot.actuator_state, snapshot.recipes
+        promised = (able.calibration_id, able.error_bound, able.error_bound_conditioned) if able is not None else ()
+        recipes = (len(book.recipes), str(book.stamp)) if book is not None else ()
+        stands = () if state is None else (state.history_known, *(round(each, 1) for each in state.requested))
+        return *promised, *recipes, *stands, self._session.running  # corrections of creep do not move it so far
 
     def _take_range(self, snapshot: Snapshot) -> None:
         capabilities = snapshot.capabilities
@@ -116,5 +120,8 @@ class FocusCard:
         except (Refusal, ValueError) as error:
             self._prediction.classes(add="refused")
             self._prediction.show(str(error))
+            if isinstance(error, Refusal) and error.error_code in PASSING:
+                await asyncio.sleep(AGAIN_S)
+                self._wish = ()
         finally:
             self._asking = False
