@@ -21,6 +21,8 @@ from dm_common.ros import qos
 from drive_unit_servers import Edac40TcpUnit, signals_of
 from support import NodeProcess, Observer, wait_until
 
+#: Age of a command whose stamp is negative.
+BEFORE_THE_EPOCH = float("inf")
 CODE = 2.0 * 12 * 80 / 300 / 65535
 
 Start = Callable[..., NodeProcess]
@@ -66,7 +68,8 @@ class Driver:
         wait_until(lambda: self._publisher.get_subscription_count() > 0, what="the driver's subscription")
         message = ActuatorCommand(signals=[float(value) for value in signals], expected_turns=expected_turns)
         if age_s is not None:
-            stamp_ns = self.observer.node.get_clock().now().nanoseconds - round(age_s * 1e9)
+            now_ns = self.observer.node.get_clock().now().nanoseconds
+            stamp_ns = -1_000_000_000 if age_s == BEFORE_THE_EPOCH else now_ns - round(age_s * 1e9)
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
         self._publisher.publish(message)
 
@@ -178,6 +181,7 @@ def test_refused_commands_leave_the_wire_alone(driver: Driver) -> None:
         (neighbours, None, ErrorCode.NEIGHBOUR_DIFFERENCE, [0, 2], "actuators 1 and 3"),
         (good, 5.0, ErrorCode.STALE, [], "s old: must be at most 1 s"),
         (good, -5.0, ErrorCode.STALE, [], "in the future"),
+        (good, BEFORE_THE_EPOCH, ErrorCode.STALE, [], "s old: must be at most 1 s"),
     ]
     for signals, age_s, code, actuators, words in cases:
         driver.command(signals, age_s)
@@ -196,7 +200,7 @@ def test_refused_commands_leave_the_wire_alone(driver: Driver) -> None:
 
     def counted() -> bool:
         values = {pair.key: pair.value for pair in driver.diagnostics[-1].status[0].values}
-        return values.get("refused STALE") == "2" and values.get("refused OUT_OF_RANGE") == "2"
+        return values.get("refused STALE") == "3" and values.get("refused OUT_OF_RANGE") == "2"
 
     wait_until(lambda: driver.diagnostics and counted(), what="the counts in the diagnostics")
     assert driver.diagnostics[-1].status[0].level == b"\x01"
@@ -212,6 +216,21 @@ def test_set_signals_answers_when_the_shape_stands(driver: Driver) -> None:
     assert answer.ramp_time == pytest.approx(1.4 / 40)
     wait_until(lambda: len(driver.unit.frames) == 16)
     assert signals_of(driver.unit.frames)[-1] == pytest.approx(0.5, abs=CODE)
+
+
+def test_a_later_set_signals_takes_over_from_one_that_waits(
+    start: Start, observer: Observer, unit: Edac40TcpUnit
+) -> None:
+    start("dm_driver", "pdm_driver", parameters(unit, limits__slew_rate=0.7))
+    driver = Driver(observer, unit)
+    driver.wait_active()
+    client = observer.node.create_client(SetSignals, "set_signals")
+    first = client.call_async(SetSignals.Request(signals=[1.0] * 37, wait=True))
+    driver.wait_for_state(lambda state: state.moving, "the first ramp")
+    assert driver.set_signals(np.full(37, -1.0), wait=True).error_code == ErrorCode.OK
+    wait_until(first.done)
+    assert first.result().error_code == ErrorCode.PREEMPTED
+    assert signals_of(unit.frames).max() < 0.9
 
 
 def test_degauss_makes_the_history_known(driver: Driver) -> None:

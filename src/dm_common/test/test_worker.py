@@ -65,13 +65,40 @@ def test_waiting_for_a_worker_does_not_poll(observer: Observer) -> None:
     assert used < 0.5, f"{used:.2f} s of CPU in 1 s of waiting: something polls"
 
 
+def test_what_has_begun_is_awaited_beside_the_requests_after_it(observer: Observer) -> None:
+    begun: list[threading.Event] = []
+
+    def begin(_request: Any, response: Any) -> Any:
+        ends = threading.Event()
+        response.message = str(len(begun))
+        for earlier in begun:
+            earlier.set()
+        begun.append(ends)
+        if len(begun) == 3:
+            return response
+
+        def end() -> Any:
+            assert ends.wait(20), "no later request began"
+            return response
+
+        return end
+
+    WorkerService(observer.node, Flatten, "begin", begin)
+    client = observer.node.create_client(Flatten, "begin")
+    wait_until(client.service_is_ready)
+    futures = [client.call_async(Flatten.Request()) for _ in range(3)]
+    wait_until(lambda: all(future.done() for future in futures))
+    assert [future.result().message for future in futures] == ["0", "1", "2"]
+
+
 def test_a_failing_service_callback_answers_with_the_reason(observer: Observer) -> None:
     def failing(_request: Any, _response: Any) -> Any:
         raise RuntimeError("the plate is bent")
 
     WorkerService(observer.node, SetSignals, "failing", failing)
     observer.node.create_service(SetSignals, "failing_at_once", never_silent(observer.node, "failing_at_once", failing))
-    for name in ("failing", "failing_at_once"):
+    WorkerService(observer.node, SetSignals, "failing_later", lambda *request: lambda: failing(*request))
+    for name in ("failing", "failing_at_once", "failing_later"):
         response = observer.call(SetSignals, name)
         assert response.error_code == ErrorCode.INTERNAL
         assert "the plate is bent" in response.message

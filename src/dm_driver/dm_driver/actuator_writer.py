@@ -27,7 +27,8 @@ class ActuatorWriter(WriterThread):
 
         No unit can be read back. The way begins at what was written last, by this object or as `last` recorded it: that
         shape is written again, then the ramp follows. When nothing is known, there is nothing to ramp from and the safe
-        shape is written in one step. Without a link this happens as soon as the link stands.
+        shape is written in one step. Without a link this happens as soon as the link stands, and a link that is lost on
+        the way only delays it; an accepted command takes its place.
         """
         known = self._known_shape()
         move: Move | None = None

@@ -62,11 +62,13 @@ def degauss_move(
     whole(0, 1, STEPS_MAX).check(name, steps)
     swing = amplitude or largest
     # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
-    duration = (steps * swing + 4.0 * largest) / limits.slew_rate
+    # On a slow line the last step of each of these ways takes as long as a whole one.
+    duration = (steps * swing + 4.0 * largest) / limits.slew_rate + (steps + 2) / limits.frames_per_second
     if not duration <= duration_max:
+        line = "" if math.isinf(limits.frames_per_second) else f" and {limits.frames_per_second:.4g} frames per second"
         raise Refusal(
             ErrorCode.OUT_OF_RANGE,
-            f"{name} = {steps}: would take {duration:.0f} s at limits.slew_rate = {limits.slew_rate:g} 1/s, "
+            f"{name} = {steps}: would take {duration:.0f} s at limits.slew_rate = {limits.slew_rate:g} 1/s{line}, "
             f"must be at most {duration_max:g} s (degauss.duration_max)",
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)

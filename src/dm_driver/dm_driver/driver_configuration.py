@@ -79,11 +79,14 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
             f"mirror.working_aperture_diameter = {values['mirror.working_aperture_diameter']:g} m: must be at most"
             f" mirror.full_aperture_diameter = {values['mirror.full_aperture_diameter']:g} m"
         )
+    step = values["limits.step"] / back_end.frames_per_step
     limits = from_values(
         DriverLimits,
         values,
         "limits.",
-        step=values["limits.step"] / back_end.frames_per_step,
+        step=step,
+        slew_rate=min(values["limits.slew_rate"], step * back_end.frames_per_second),
+        frames_per_second=back_end.frames_per_second,
         actuators=actuators,
         low=values["limits.signal_min"],
         high=values["limits.signal_max"],

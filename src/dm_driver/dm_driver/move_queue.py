@@ -84,12 +84,12 @@ class MoveQueue:
             self.degausses += move.wipes
         return True
 
-    def end_all(self, outcome: Outcome, shape: Shape | None) -> None:
-        """End all moves where the mirror stands, at `shape` (N,) as it was written last."""
+    def end_all(self, outcome: Outcome, shape: Shape | None, keep: Move | None = None) -> None:
+        """End all moves but `keep`, which begins anew, where the mirror stands: `shape` (N,) as it was written last."""
         for move in (self.pending, self.current):
-            if move is not None:
+            if move is not None and move is not keep:
                 move.finish(outcome)
-        self.pending = self.current = None
+        self.pending, self.current = keep, None
         if shape is not None:
             self.requested = shape
 

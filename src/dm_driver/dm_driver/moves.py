@@ -90,7 +90,7 @@ class WriterState:
     Attributes:
         link_up: the electronics are open.
         enabled: writes are allowed.
-        moving: kind of the move under way; None when the mirror rests.
+        moving: kind of the move under way; None when the mirror rests or the link is down.
         requested: (N,) where the last accepted move leads; None before the first write.
         applied: (N,) what stands at the actuators, after quantisation; None before the first write.
         volts: (N,) V at the actuators for `applied`.

@@ -14,9 +14,9 @@ from typing import Any
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
-from rclpy.time import Time
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.messages import stamp_ns
 from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import Health, ManagedNode
@@ -70,6 +70,12 @@ class PdmDriverNode(ManagedNode):
 
     def configure(self) -> None:
         configuration = build_configuration(self._values)
+        asked, limits = self._values["limits.slew_rate"], configuration.limiter.limits
+        if limits.slew_rate < asked:
+            self.get_logger().info(
+                f"limits.slew_rate = {asked:g} 1/s: {limits.slew_rate:.4g} 1/s is used, for the line carries"
+                f" {limits.frames_per_second:.4g} frames per second, each a step of at most {limits.step:g}"
+            )
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
@@ -153,9 +159,8 @@ class PdmDriverNode(ManagedNode):
 
     def _on_command(self, message: ActuatorCommand) -> None:
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
-            stamp = Time.from_msg(message.header.stamp, self.get_clock().clock_type)
-            if stamp.nanoseconds:
-                configuration.limiter.check_age((self.get_clock().now() - stamp).nanoseconds * 1e-9)
+            if stamp := stamp_ns(message.header.stamp):
+                configuration.limiter.check_age((self.get_clock().now().nanoseconds - stamp) * 1e-9)
             shape = configuration.limiter.check_shape(message.signals)
             return writer.correct(shape, message.expected_turns) if message.expected_turns else writer.command(shape)
 
@@ -175,9 +180,12 @@ class PdmDriverNode(ManagedNode):
         if isinstance(result, Refusal):
             response.error_code, response.message = result.error_code, str(result)
         elif result is not None and request.wait:
-            outcome = result.wait()
-            if outcome is not None and outcome is not Outcome.REACHED:
-                response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
+            return lambda: self._signals_set(response, result.wait())
+        return self._signals_set(response)
+
+    def _signals_set(self, response: Any, outcome: Outcome | None = None) -> Any:
+        if outcome is not None and outcome is not Outcome.REACHED:
+            response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
         writer = self._gate.writer
         if writer is not None and (applied := writer.state().applied) is not None:
             response.applied.frombytes(applied.tobytes())

@@ -28,16 +28,21 @@ class DriverLimits(Limits):
 
     Attributes:
         actuators: number of signals N.
+        frames_per_second: most writes that the electronics take, Hz; `slew_rate` is at most `step` times this.
 
     Raises:
         ValueError: naming the parameter that is wrong.
     """
 
     actuators: int
-    slew_rate: float = parameter(real(40.0, 1e-3, 1e6, "1/s"), "Largest mean rate of change of a signal.")
+    slew_rate: float = parameter(
+        real(40.0, 1e-3, 1e6, "1/s"),
+        "Largest mean rate of change of a signal; a serial line allows at most limits.step a frame.",
+    )
     step: float = parameter(real(0.1, 1e-4, 2.0), "Largest change of a signal in one write.")
     command_age: float = parameter(real(1.0, 1e-3, 1e9, "s"), "Commands with an older stamp are refused.")
     command_lead: float = parameter(real(0.5, 1e-3, 1e9, "s"), "Commands stamped further ahead are refused.")
+    frames_per_second: float = math.inf
 
     def __post_init__(self) -> None:
         if not -1.0 <= self.low < self.high <= 1.0:
@@ -144,7 +149,8 @@ class SafetyLimiter:
         """Seconds from the first to the last write of a move."""
         change = largest_change(start, target)
         steps = max(1, math.ceil(change / self.limits.step - SLACK))
-        return change / self.limits.slew_rate * (steps - 1) / steps
+        # A short step waits for the line all the same.
+        return (steps - 1) * max(change / steps / self.limits.slew_rate, 1.0 / self.limits.frames_per_second)
 
     def _check_neighbours(self, shape: Shape, name: str, slack: float) -> None:
         limits = self.limits

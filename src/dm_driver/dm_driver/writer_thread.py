@@ -1,7 +1,8 @@
 """The one thread that owns the drive electronics.
 
 It writes one step of the current move after the other, paced so that the slew rate holds, and leaves a move at once for
-a newer one. After a lost link it tries to reconnect once a second and then writes the last shape again.
+a newer one. After a lost link it tries to reconnect once a second, then writes the last shape again and goes on to the
+safe shape where it was on its way there.
 """
 
 import logging
@@ -108,7 +109,7 @@ class WriterThread:
             return WriterState(
                 link_up=self._link_up,
                 enabled=self._enabled,
-                moving=queue.newest.kind if queue.newest is not None else None,
+                moving=queue.newest.kind if self._link_up and queue.newest is not None else None,
                 requested=queue.requested if self._applied is not None else None,
                 applied=self._applied,
                 volts=self._volts,
@@ -236,7 +237,7 @@ class WriterThread:
         self._record(shape)
         codes = self._output.codes(shape)
         self._electronics.write(codes, self._output.wired)
-        written_ns, now = self._stamp_ns(), time.monotonic()
+        written_ns, now = self._stamp_ns(), self._electronics.sent_at
         with self._change:
             self._shape = shape
             self._applied, self._volts = self._output.outcome(codes)
@@ -271,7 +272,11 @@ class WriterThread:
             self._fault = reason
             self._queue.history_known = False
             self._rewrite_due = self._enabled
-            self._queue.end_all(Outcome.LINK_LOST, self._shape)
+            # No other move outlives the link, but the way to the safe shape was promised. That of `disable` is waited
+            # for and must end.
+            newest = self._queue.newest
+            to_safe = self._accepting and newest is not None and newest.kind is Kind.SAFE
+            self._queue.end_all(Outcome.LINK_LOST, self._shape, newest if to_safe else None)
             if lost:
                 self.counters.link_losses += 1
                 self._retry_at = time.monotonic() + RECONNECT_PERIOD_S

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
+from dm_driver.last_shape import LastShape
 from dm_driver.moves import Kind, Move, Outcome, WriterState
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import OutputStage, wiring_table
@@ -39,9 +41,10 @@ def limits(slew_rate: float) -> DriverLimits:
 
 
 @contextmanager
-def running_writer(
+def started_writer(
     unit: Edac40TcpUnit, slew_rate: float = 1000.0, electronics: type[Edac40Tcp] = Edac40Tcp, **arguments: Any
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
+    """A writer that is not enabled yet, and what it told."""
     told: list[tuple[WriterState, bool]] = []
     writer = ActuatorWriter(
         electronics(ElectronicsSettings("127.0.0.1", unit.port, timeout_s=0.5)),
@@ -53,11 +56,19 @@ def running_writer(
     )
     writer.start()
     try:
-        assert writer.wait_for_link(5)
-        assert writer.enable(5)
         yield writer, told
     finally:
         assert writer.stop()
+
+
+@contextmanager
+def running_writer(
+    unit: Edac40TcpUnit, *arguments: Any, **keywords: Any
+) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
+    with started_writer(unit, *arguments, **keywords) as (writer, told):
+        assert writer.wait_for_link(5)
+        assert writer.enable(5)
+        yield writer, told
 
 
 def shape(value: float) -> np.ndarray:
@@ -326,6 +337,78 @@ def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUni
         assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
         assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
         assert writer.enable(5)
+
+
+class Counting(Edac40Tcp):
+    """Counts how often the link was tried: at the second of two tries the first one has failed."""
+
+    tries = 0
+
+    def _do_open(self) -> None:
+        self.tries += 1
+        super()._do_open()
+
+
+def fail_to_connect(writer: ActuatorWriter) -> None:
+    """Wait until the link was tried in vain since the call."""
+    electronics = writer._electronics
+    assert isinstance(electronics, Counting)
+    tries = electronics.tries
+    wait_until(lambda: electronics.tries >= tries + 2, what="a link that was tried in vain")
+
+
+def ramp_to_safe_shape(unit: Edac40TcpUnit, begins_at: float, since: int = 0) -> None:
+    """Wait until a ramp to the safe shape has arrived, and judge the frames from number `since` on."""
+    arrived = pytest.approx(-1.0, abs=CODE)
+    wait_until(lambda: len(unit.frames) > since and signals_of(unit.frames[-1:]) == arrived, what="safe shape")
+    on_wire = signals_of(unit.frames[since:])
+    assert on_wire[0] == pytest.approx(begins_at, abs=CODE)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+
+
+def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpUnit, tmp_path: Path) -> None:
+    last = LastShape(tmp_path / "unit.shape", 37)
+    last.note(shape(0.8))  # by a driver that was killed
+    unit.unplug()
+    with started_writer(unit, electronics=Counting, last=last) as (writer, _told):
+        assert not writer.enable(0.0)
+        fail_to_connect(writer)
+        assert writer.state().moving is None
+        unit.plug()
+        ramp_to_safe_shape(unit, 0.8)
+        assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
+        unit.unplug()
+        wait_until(lambda: not writer.state().link_up)
+        assert writer.disable(5) is Outcome.LINK_LOST
+        assert not writer.enable(0.0)
+        fail_to_connect(writer)
+        frames = len(unit.frames)
+        unit.plug()
+        ramp_to_safe_shape(unit, 0.5, frames)
+
+
+@pytest.mark.parametrize("commanded", [False, True])
+def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path: Path, commanded: bool) -> None:
+    """The way goes on, unless an accepted command took its place: then the shape stays where the link was lost."""
+    last = LastShape(tmp_path / "unit.shape", 37)
+    last.note(shape(0.8))
+    with started_writer(unit, slew_rate=1.0, last=last) as (writer, _told):
+        assert writer.wait_for_link(5)
+        writer.enable(0.0)
+        wait_until(lambda: len(unit.frames) > 2)
+        move = writer.command(shape(0.9)) if commanded else None
+        unit.unplug()
+        wait_until(lambda: not writer.state().link_up)
+        lost, frames = writer.state(), len(unit.frames)
+        assert lost.applied is not None and -1.0 + CODE < lost.applied[0] < 0.9 - CODE
+        unit.plug()
+        if move is None:
+            ramp_to_safe_shape(unit, lost.applied[0], frames)
+        else:
+            assert move.wait(5) is Outcome.LINK_LOST
+            wait_until(lambda: writer.state().link_up)
+            assert writer.state().moving is None
+            assert signals_of(unit.frames[-1:]) == pytest.approx(lost.applied[0], abs=CODE)
 
 
 def test_disable_without_a_link_says_so(unit: Edac40TcpUnit) -> None:

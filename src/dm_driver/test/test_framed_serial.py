@@ -16,8 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dm_common.messages import time_message
 from dm_common.ros.parameters import REQUIRED
+from dm_driver.degauss import degauss_move
 from dm_driver.driver_configuration import build_configuration
+from dm_driver.driver_messages import mirror_info_message
 from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.electronics.base import ElectronicsSettings, LinkError
 from dm_driver.electronics.check_sums import CHECK_SUMS
@@ -114,16 +117,50 @@ def test_what_cannot_be_is_refused(format: dict[str, Any], words: str) -> None:
         FrameFormat(**format)
 
 
-def test_the_driver_names_a_wrong_parameter() -> None:
+def whole_configuration() -> dict[str, Any]:
+    """Of a unit with 40 channels of 16 bit at 115200 bit/s."""
     values = {parameter.name: parameter.default for parameter in PARAMETERS if parameter.default is not REQUIRED}
     values |= {"mirror.serial": "1", "electronics.kind": "framed_serial", "electronics.serial_port": "/dev/ttyUSB0"}
     values |= {"volts.dac_at_zero": 0.0, "volts.dac_at_full": 5.0, "volts.amplifier_gain": 80.0}
-    values |= {"volts.min": 0.0, "volts.max": 300.0}
+    return values | {"volts.min": 0.0, "volts.max": 300.0}
+
+
+def test_the_driver_names_a_wrong_parameter() -> None:
+    values = whole_configuration()
     assert build_configuration(values).electronics.channels == 40
     with pytest.raises(ValueError, match=r"framed_serial\.terminator = 'CR'"):
         build_configuration(values | {"framed_serial.terminator": "CR"})
     with pytest.raises(ValueError, match=r"actuator 3 on channel 38; must be 0 to 37"):
         build_configuration(values | {"framed_serial.channels": 38})
+
+
+def test_the_slew_rate_is_what_the_line_carries() -> None:
+    configuration = build_configuration(whole_configuration())
+    limiter, rate = configuration.limiter, configuration.electronics.frames_per_second
+    assert rate == 144.0
+    assert limiter.limits.slew_rate == pytest.approx(0.1 * rate)
+    info = mirror_info_message(whole_configuration(), configuration, "mirror", time_message(0))
+    assert info.slew_rate_max == pytest.approx(0.1 * rate)
+    start = np.full(37, -1.0)
+    for target, frames in ((start + 1.0, 10), (start + 0.11, 2), (start + 0.05, 1)):
+        assert limiter.ramp_time(start, target) == pytest.approx((frames - 1) / rate)
+    slow = build_configuration(whole_configuration() | {"limits.slew_rate": 2.0}).limiter
+    assert slow.limits.slew_rate == 2.0
+    assert slow.ramp_time(start, start + 1.0) == pytest.approx(0.9 / 2.0)
+
+
+@pytest.mark.parametrize(("amplitude", "steps"), [(0.0, 100), (0.01, 1000), (0.3, 7)])
+def test_a_degauss_needs_no_more_frames_than_its_duration_has(amplitude: float, steps: int) -> None:
+    limiter = build_configuration(whole_configuration()).limiter
+    move = degauss_move(limiter.limits, amplitude, steps, np.full(37, 0.5))
+    frames = sum(1 for _ in limiter.path(np.full(37, 1.0), move.way()))
+    assert frames / limiter.limits.frames_per_second <= move.duration
+
+
+def test_a_degauss_that_the_line_makes_too_long_is_refused() -> None:
+    slow = whole_configuration() | {"framed_serial.baud_rate": 4800}
+    with pytest.raises(ValueError, match=r"100: would take 190 s at .* = 0.6 1/s and 6 frames per second, must be at"):
+        build_configuration(slow)
 
 
 @pytest.fixture
@@ -174,6 +211,24 @@ def test_a_wrong_answer_breaks_the_link(line: tuple[int, str]) -> None:
         with pytest.raises(LinkError, match="answered 15 "):
             electronics.write(CODES, ALL_ON)
     unit.join()
+
+
+def test_the_pause_counts_from_the_frame_and_not_from_its_answer(line: tuple[int, str]) -> None:
+    """Else a frame, its answer and the pause after it would take twice what the slew rate promises."""
+    answered: list[float] = []
+    with of_four(line, timeout_s=20.0, reply="06") as electronics:
+
+        def answer() -> None:
+            os.read(line[0], 4)
+            wait_until(lambda: electronics.sent_at > 0.0)
+            answered.append(time.monotonic())
+            os.write(line[0], b"\x06")
+
+        unit = threading.Thread(target=answer)
+        unit.start()
+        electronics.write(CODES, ALL_ON)
+        unit.join()
+        assert 0.0 < electronics.sent_at <= answered[0]
 
 
 def test_the_opening_comes_once(line: tuple[int, str]) -> None:

@@ -83,7 +83,8 @@ class WorkerService:
     """A service whose callback runs in a worker thread.
 
     `callback(request, response) -> response` may block. Requests of one service are served one after another, in order;
-    `fields` are checked first.
+    `fields` are checked first. It may return a function instead, which waits for the end of what has begun and returns
+    the response: the next request is served meanwhile; where it begins something too, that must end the wait.
     """
 
     def __init__(
@@ -91,26 +92,28 @@ class WorkerService:
     ) -> None:
         self._node = node
         self._callback = never_silent(node, name, callback, fields)
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name.replace("/", "_"))
-        self._service: Service = node.create_service(
-            srv_type, name, lambda request, response: (request, response), qos_profile=qos.SERVICE
-        )
+        self._pool, self._ends = (ThreadPoolExecutor(1, name.replace("/", "_") + end) for end in ("", "_end"))
+        self._service: Service = node.create_service(srv_type, name, lambda *both: both, qos_profile=qos.SERVICE)
         # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
         # where the header that a later answer needs can be had.
         self._send = until_discovered(self._service.send_response)
         self._service.send_response = self._start
 
     def _start(self, request_and_response: tuple[Any, Any], header: Any) -> None:
-        self._pool.submit(self._work, *request_and_response, header)
+        self._pool.submit(self._work, self._callback, *request_and_response, header)
 
-    def _work(self, request: Any, response: Any, header: Any) -> None:
-        response = self._callback(request, response)
-        if self._node.executor is not None:
-            self._node.executor.create_task(self._send, response, header)
+    def _work(self, callback: Callable[[Any, Any], Any], request: Any, response: Any, header: Any) -> None:
+        answer = callback(request, response)
+        if callable(answer):
+            end = never_silent(self._node, self._service.srv_name, lambda *_: answer())
+            self._ends.submit(self._work, end, request, response, header)
+        elif self._node.executor is not None:
+            self._node.executor.create_task(self._send, answer, header)
 
     def destroy(self) -> None:
         """Stop taking requests and drop those not yet begun."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+        self._ends.shutdown(wait=False, cancel_futures=True)
         self._node.destroy_service(self._service)
 
 

@@ -1,6 +1,8 @@
 """What every drive unit offers: a number of output channels that take integer codes, and a link that can break."""
 
+import math
 import re
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -88,6 +90,8 @@ class DriveElectronics(ABC):
     #: Frames per `limits.step` of a ramp: more than one where a frame may be lost without a trace, so that the next one
     #: is no larger step.
     frames_per_step: int = 1
+    #: Most frames that the link carries, Hz: predicted times go by it. Infinite = none is known.
+    frames_per_second: float = math.inf
     #: Whether `volts.*` are volts at the actuators; False where the unit takes other numbers.
     knows_volts: bool = True
 
@@ -108,6 +112,11 @@ class DriveElectronics(ABC):
     @property
     def is_open(self) -> bool:
         return self._open
+
+    @property
+    def sent_at(self) -> float:
+        """Steady time from which the pause until the next frame counts, s; asked for when `write` has returned."""
+        return time.monotonic()
 
     def open(self) -> None:
         """Open the link. Opening an open link does nothing; no output changes.

@@ -1,5 +1,6 @@
 """Any drive unit that takes whole frames over a serial line, described by parameters alone."""
 
+import math
 import time
 
 import numpy as np
@@ -27,12 +28,17 @@ class FramedSerial(DriveElectronics):
         self.max_code = frame.max_code
         self._reply = bytes.fromhex(frame.reply)
         # Frames that the line cannot carry would queue in the system, and the mirror lag behind its commands.
-        self._period_s = 1.0 / (frame.frame_rate or frame.line_rate)
-        self._free_at = 0.0
+        self.frames_per_second = frame.frame_rate or frame.line_rate
+        self._sent_at = -math.inf
 
     @property
     def where(self) -> str:
         return f"framed serial unit at {self._settings.serial_port}"
+
+    @property
+    def sent_at(self) -> float:
+        """Before the answer came: the frame and its answer share the time that the line needs for one."""
+        return self._sent_at
 
     def _do_open(self) -> None:
         # Exclusive: two writers on one unit would tear each other's frames.
@@ -50,13 +56,13 @@ class FramedSerial(DriveElectronics):
             self._link.write(opening)
 
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
-        pause = self._free_at - time.monotonic()
+        pause = self._sent_at + 1.0 / self.frames_per_second - time.monotonic()
         if pause > 0.0:
             time.sleep(pause)
         if self._reply:
             self._do_check()  # a late answer is not the answer to this frame
         self._link.write(self._frame.encode(codes))
-        self._free_at = time.monotonic() + self._period_s
+        self._sent_at = time.monotonic()
         if self._reply:
             answer = self._link.read(len(self._reply))
             if answer != self._reply:
