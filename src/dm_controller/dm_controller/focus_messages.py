@@ -62,7 +62,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
         most = f"most of that for {plan.most}" if plan.most else ""
         state.message = "; ".join(filter(None, (text, most, remarks(active, order.unknown, values, order.began.ns))))
     if refusal is not None:
-        state.error_code, state.message = refusal.error_code, str(refusal)
+        state.error_code, state.message, state.creep_held = refusal.error_code, str(refusal), False
     return state
 
 

@@ -420,11 +420,12 @@ def test_the_newest_request_wins(bench: Bench) -> None:
 
 def test_who_holds_the_mirror_has_it_alone(bench: Bench) -> None:
     bench.degauss()
-    bench.ask(0.01)
+    assert state_message(bench.ask(0.01), VALUES, None).creep_held
     bench.holder = "calibration"
     bench.report()
-    bench.ask(0.02)
+    refused = state_message(bench.ask(0.02), VALUES, None)
     assert bench.refusal().error_code == ErrorCode.BUSY and "calibration holds it" in str(bench.refusal())
+    assert not refused.creep_held and len(refused.signals)  # what it would be, and that nothing holds it
     assert bench.ask(0.02, dry_run=True).refusal is None
     bench.wait(30.0)
     assert len(bench.commands) == 1 and bench.controller.hold.active
