@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +12,12 @@ import pytest
 from dm_common.errors import Refusal
 from dm_common.measurement import Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
+from dm_controller.converge.converge_run import ConvergeRun
+from dm_controller.planning.active_calibration import active_calibration
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
 from dm_controller.solvers.registry import make_solver
+from focus_bench import calibration, mirror_info
 from linear_mirror import RADIUS
 from linear_plant import LIMITS, MODEL, LinearPlant
 
@@ -156,3 +161,17 @@ def test_the_response_ratio_counts_terms_by_their_rms() -> None:
 def test_a_surface_that_does_not_exist_is_refused(solver: Solver) -> None:
     with pytest.raises(TargetError):
         converge(solver, FocusTarget(200.0), LinearPlant())
+
+
+@pytest.mark.parametrize(
+    ("hold_tilt", "axis", "tilt"), [(True, (3e-3, 0.0), 0.0), (True, (0.0, 0.0), 300e-9), (False, (0.0, 0.0), 0.0)]
+)
+def test_the_action_begins_with_the_tilt_that_a_move_has(
+    hold_tilt: bool, axis: tuple[float, float], tilt: float
+) -> None:
+    active = active_calibration(calibration(), mirror_info(), hold_tilt, axis)
+    bench: Any = SimpleNamespace(parameters={}, active_calibration=lambda: active)
+    target = FocusTarget(0.02, 0.0, (0.0, tilt, *19 * (0.0,)))
+    result = converge(ConvergeRun(bench)._solver(""), target, LinearPlant())
+    assert result.converged
+    np.testing.assert_array_equal(result.signals, active.mirror.command(target)[0])

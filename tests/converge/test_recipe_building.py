@@ -23,6 +23,7 @@ from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError, recipe_targets
 from dm_controller.planning.target import FocusTarget
+from linear_mirror import hexagon
 from linear_plant import LIMITS, MODEL, LinearPlant
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
@@ -152,6 +153,32 @@ def test_averaging_takes_the_noise_down() -> None:
     assert many < 0.5 * few
 
 
+@pytest.mark.parametrize("hold_tilt", [True, False])
+def test_a_recipe_has_the_tilt_that_a_move_has(hold_tilt: bool) -> None:
+    """As asked for when it is built, and to the last bit when it is asked for again; else as asked for then."""
+    x, y = hexagon()
+    model, tilted = replace(MODEL, actuator_x=x, actuator_y=y), (0.0, 300e-9, *19 * (0.0,))
+    planners = [Planner(CalibratedMirror(model, LIMITS, axis=(place, 0.0))) for place in (0.0, 3e-3)]
+    builder = planners[1] if hold_tilt else Planner(CalibratedMirror(model, LIMITS, hold_tilt=False))
+    plant, target = LinearPlant(GAINS), FocusTarget(0.02, 0.0, tilted)
+    recipe = RecipeBuilder(builder, plant, lambda: plant.time, BuildOptions(1e-9)).build(target)
+    book = recipe_book([recipe], builder, 100, 0)
+    as_built = Corrections(book, builder).find(target)
+    np.testing.assert_array_equal(as_built.effective, recipe.effective)
+    for planner in planners:
+        for zernike in (tilted, ()):
+            wanted = FocusTarget(0.02, 0.0, zernike)
+            found, tilt = Corrections(book, planner).find(wanted), planner.mirror.tilt
+            assert tilt is not None
+            np.testing.assert_allclose(tilt @ found.effective, planner.mirror.wanted(wanted)[1], atol=10e-9)
+            shape = model.influence_zernike[3:] @ (found.effective - recipe.effective)
+            assert np.abs(shape).max() < 1e-10
+            if planner is builder and zernike:
+                np.testing.assert_array_equal(found.effective, recipe.effective)
+            else:
+                assert found.error > as_built.error
+
+
 def test_cancelling_stops_between_two_maps() -> None:
     plant = LinearPlant(GAINS)
     builder = RecipeBuilder(LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3)
@@ -163,7 +190,7 @@ def test_cancelling_stops_between_two_maps() -> None:
 @pytest.mark.parametrize(
     ("curvatures", "zernike", "error", "words"),
     [
-        ((0.0, float("nan")), (), Refusal, "curvature = nan: must be a finite float"),
+        ((0.0, float("nan")), (), Refusal, r"curvature = nan: must be float, -1e\+06 to 1e\+06 1/m"),
         ((0.01, 0.02, 0.01), (), RecipeError, r"curvatures: \+0\.0100 1/m is there twice"),
         ((0.01, 0.01), 42 * (1e-8,), RecipeError, r"\+0\.0100 1/m with .*coma sin \+10 nm.* is there twice"),
         ((0.0, 5.0), (), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),

@@ -12,7 +12,7 @@ from dm_controller.focus_parameters import REACHABLE_TOLERANCE
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
-from focus_bench import calibration_with_history, mirror_info
+from focus_bench import calibration, calibration_with_history, make_law, mirror_info
 from linear_mirror import make_mirror
 
 ACTUATORS = 37
@@ -30,10 +30,14 @@ def law(rng: np.random.Generator) -> HysteresisModel:
     return normalised(model)
 
 
-def active(difference: float, rng: np.random.Generator) -> ActiveCalibration:
+def active_under(law: HysteresisModel, difference: float) -> ActiveCalibration:
     mirror = mirror_info()
     mirror.neighbour_difference_max = difference
-    return active_calibration(calibration_with_history(law(rng)), mirror)
+    return active_calibration(calibration_with_history(law), mirror)
+
+
+def active(difference: float, rng: np.random.Generator) -> ActiveCalibration:
+    return active_under(law(rng), difference)
 
 
 def written(signals: Floats) -> Floats:
@@ -89,3 +93,40 @@ def test_a_limit_that_binds_costs_no_more_than_it_must() -> None:
         state = plans.law.move(state, rng.uniform(-0.4, 0.4, ACTUATORS), state.time + 1.0)
     move = plans.plan(FocusTarget(0.97 * high), state, state.time + 1.0, ahead=0.05)
     assert move.plan.max_zernike < 40e-9
+
+
+@pytest.mark.parametrize(
+    ("difference", "curvature", "left"),
+    [(0.2, 0.05, 0.1e-9), (0.2, 0.12, 60e-9), (2.0, 0.29, 0.1e-9), (2.0, 0.325, 90e-9)],
+)
+def test_limits_that_bind_are_told_and_beyond_the_range_they_are_used_up(
+    difference: float, curvature: float, left: float
+) -> None:
+    """Those of the signals: effective signals cut at the same numbers leave 203 nm at 0.12 1/m, 120 at 0.325."""
+    plans = active_under(make_law(), difference).planner
+    move = plans.plan(FocusTarget(curvature), plans.law.demagnetised(ACTUATORS, 0.0), 0.0, ahead=0.05)
+    assert move.max_zernike == pytest.approx(move.plan.max_zernike)
+    assert move.max_zernike < left
+    apart = np.abs(np.subtract(*move.signals[PAIRS].T))
+    bound = np.abs(move.signals) > 1.0 - 1e-6
+    bound[PAIRS[apart > difference - 1.1 * DAC_STEP]] = True
+    assert bound.any()
+    np.testing.assert_array_equal(move.plan.saturated, bound)
+
+
+def test_a_limit_between_neighbours_that_cannot_bind_takes_nothing_away() -> None:
+    plans = active_under(make_law(), 2.0).planner
+    move = plans.plan(FocusTarget(0.325), plans.law.demagnetised(ACTUATORS, 0.0), 0.0, ahead=0.05)
+    assert np.abs(np.subtract(*move.signals[PAIRS].T)).max() == 2.0
+
+
+def test_a_recipe_beyond_the_limits_is_commanded_inside_them_without_hysteresis_too() -> None:
+    mirror = mirror_info()
+    mirror.neighbour_difference_max = 0.3
+    plans = active_calibration(calibration(), mirror).planner
+    inside = plans.mirror.command(FocusTarget(0.05))[0]
+    state = plans.law.demagnetised(ACTUATORS, 0.0)
+    for share in (1.0, 4.0):
+        move = plans.plan(FocusTarget(0.05), state, 0.0, effective=share * inside, error=1e-9)
+        assert plans.mirror.limits.allow(move.signals)
+        assert (share * inside == move.signals).all() == (move.max_zernike <= 1e-9) == (share == 1.0)

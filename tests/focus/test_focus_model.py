@@ -119,7 +119,7 @@ def test_nothing_is_reachable_with_terms_beyond_the_stroke(mirror: LinearMirror)
         ({"curvature": math.nan}, "curvature = nan"),
         ({"curvature": 0.0, "conic_constant": math.inf}, "conic_constant = inf"),
         ({"curvature": 0.0, "zernike": (0.0, 1.0)}, "zernike has 2 values: must have 0 or 21"),
-        ({"curvature": 0.0, "zernike": (math.nan,) * 21}, r"zernike\[0\] = nan: must be a finite float"),
+        ({"curvature": 0.0, "zernike": (math.nan,) * 21}, r"zernike\[0\] = nan: must be float\[\], -1 to 1 m"),
     ],
 )
 def test_impossible_requests_are_refused_by_name(arguments: dict[str, object], words: str) -> None:

@@ -332,6 +332,12 @@ def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None
     [
         ({"curvature": float("nan")}, ErrorCode.NOT_FINITE, "curvature = nan"),
         ({"curvature": 9.0}, ErrorCode.UNREACHABLE, "reachable:"),
+        ({"curvature": 1e160}, ErrorCode.OUT_OF_RANGE, "curvature = 1e+160: must be float, -1e+06 to 1e+06 1/m"),
+        ({"curvature": -1e6}, ErrorCode.OUT_OF_RANGE, "must be below 1"),
+        ({"curvature": -1e6, "conic_constant": -1.0}, ErrorCode.UNREACHABLE, "reachable:"),
+        ({"conic_constant": 1e300}, ErrorCode.OUT_OF_RANGE, "conic_constant = 1e+300: must be float, -1e+09 to 1e+09"),
+        ({"zernike": [0.0, 1e308] + [0.0] * 19}, ErrorCode.OUT_OF_RANGE, "zernike[1] = 1e+308: must be float[], -1 to"),
+        ({"zernike": [1.0] * 21}, ErrorCode.UNREACHABLE, "no curvature is reachable"),
         ({"mode": "7"}, ErrorCode.UNKNOWN_NAME, "mode = '7': must be one of empty, auto, direct, conditioned"),
         ({"time_budget": -1.0}, ErrorCode.OUT_OF_RANGE, "time_budget = -1.0: must be"),
         ({"header": Header(stamp=time_message(1))}, ErrorCode.STALE, "header.stamp"),
@@ -344,6 +350,15 @@ def test_a_request_that_makes_no_sense_is_refused(bench: Bench, fields: dict[str
     assert bench.refusal().error_code == code
     assert text in str(bench.refusal())
     assert bench.log[-1].startswith("refused: ")
+
+
+def test_a_conic_that_ends_early_narrows_the_range_and_no_more(bench: Bench) -> None:
+    """This one reaches the edge of the aperture; at other curvatures that the mirror can take it does not."""
+    order = bench.ask(0.001, conic_constant=1e6)
+    state = state_message(order, VALUES, None)
+    assert order.refusal is None and order.applied and state.error_code == ErrorCode.OK
+    assert -0.1 < state.curvature_min < -0.001 and 0.001 < state.curvature_max < 0.1
+    assert state_message(bench.ask(0.001), VALUES, None).curvature_max > state.curvature_max
 
 
 def test_a_request_that_makes_no_sense_is_told_so_without_a_calibration_too(bench: Bench) -> None:
@@ -684,7 +699,11 @@ def test_a_degauss_that_fails_ends_the_order(
 
 
 def test_a_recipe_follows_its_degauss(bench: Bench) -> None:
+    assert bench.controller.active is not None
+    tilt = bench.controller.active.mirror.tilt
+    assert tilt is not None
     effective = np.random.default_rng(3).uniform(-0.4, 0.4, ACTUATORS)
+    effective -= np.linalg.pinv(tilt) @ tilt @ effective  # which every recipe has as it is wanted
     recipe = Recipe(curvature=0.01, effective=doubles(effective), signals=doubles(effective), max_zernike=5e-10)
     book = RecipeBook(calibration_id="recipes", degauss_steps=60, recipes=[recipe])
     bench.do(bench.controller.use(calibration("recipes"), MIRROR, book))

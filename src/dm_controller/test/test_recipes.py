@@ -42,6 +42,7 @@ class StandIn:
     def __init__(self, held_out: float, in_use: float = 1.0) -> None:
         self.mirror = SimpleNamespace(
             command=lambda target: (own(target), 0.0),
+            tilt=None,
             model=SimpleNamespace(influence_zernike=INFLUENCE, held_out_max_zernike=held_out, aperture_radius=0.11),
         )
         self.hysteresis = None

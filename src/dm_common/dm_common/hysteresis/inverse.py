@@ -198,7 +198,9 @@ pieces = lru_cache(maxsize=8)(Pieces)
 
 
 def within(limits: Limits) -> Limits:
-    """`limits` with room for the rounding of the electronics."""
+    """`limits` with room for the rounding of the electronics, where neighbours can differ by more than their limit."""
+    if not limits.neighbours_can_bind:
+        return limits
     return replace(limits, neighbour_difference=max(limits.neighbour_difference - DAC_STEP, 0.5 * DAC_STEP))
 
 

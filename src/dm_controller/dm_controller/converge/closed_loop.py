@@ -182,7 +182,7 @@ def converge(
     options = options or LoopOptions()
     model = solver.model
     wanted = target_shape(target, model)
-    command = solver.solve(wanted)
+    command = solver.command(target)
     signals, overflow = (command.signals, command.overflow) if start is None else (start, 0.0)
     steps: list[LoopStep] = []
     damping, scale = 1.0, 1.0

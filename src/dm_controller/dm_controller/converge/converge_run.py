@@ -81,8 +81,8 @@ class ConvergeRun:
 
     def _solver(self, method: str) -> Solver:
         active = self._bench.active_calibration()
-        weights = active.calibration.region_weights
-        return make_solver(method, active.mirror.model, active.mirror.limits, weights if len(weights) else None)
+        mirror, weights = active.mirror, active.calibration.region_weights
+        return make_solver(method, mirror.model, mirror.limits, weights if len(weights) else None, mirror)
 
     def _judge(self, outcome: LoopResult) -> tuple[int, str]:
         best = outcome.best

@@ -172,9 +172,9 @@ class RecipeBuilder:
     def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
         """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without any."""
         mirror = self._loop.mirror
-        wanted = target_shape(target, mirror.model) - mirror.model.offset
+        wanted, tilt = mirror.wanted(target)
         change = wanted if near is None else wanted - self._defects.at(near)
-        return mirror.solve(mirror.rows(change))
+        return mirror.solve(mirror.rows(change, tilt))
 
     def _predicted(self, effective: Floats) -> Shape:
         model = self._loop.mirror.model

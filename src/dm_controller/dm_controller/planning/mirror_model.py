@@ -12,7 +12,7 @@ from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
-from dm_controller.planning.target import FocusTarget, Shape
+from dm_controller.planning.target import FocusTarget, Shape, TargetError
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
@@ -162,9 +162,7 @@ class CalibratedMirror:
     def __init__(
         self, model: InfluenceModel, limits: Limits, hold_tilt: bool = True, axis: Sequence[float] = (0.0, 0.0)
     ) -> None:
-        self.model = model
-        self.limits = limits
-        self.axis = np.array(axis, dtype=float)
+        self.model, self.limits, self.axis = model, limits, np.array(axis, dtype=float)
         self._weights = np.sqrt(model.sample_weight)
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
         self._tilt_free = self._terms[:, :PISTON_TILT]
@@ -276,25 +274,27 @@ class CalibratedMirror:
 
     def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         model, near = self.model, 0.0
-        if self.command(target)[1] > tolerance:
+        if not self._reaches(target, tolerance):
             # A mirror that is only pulled does not reach 0.
             defocus = model.zernike_offset[3] + self.limits.middle * model.influence_zernike[3].sum()
             near = curvature_of_defocus(float(defocus), model.aperture_radius)
-            if self.command(target.with_curvature(near))[1] > tolerance:
+            if not self._reaches(target.with_curvature(near), tolerance):
                 return (float("nan"), float("nan"))
         # Beyond this the stroke of all actuators together could not follow.
         stroke = (self.limits.high - self.limits.low) * float(np.abs(model.influence_zernike[3]).sum())
         far = curvature_of_defocus(stroke, model.aperture_radius)
         return (self._bisect(target, near, near - far, tolerance), self._bisect(target, near, near + far, tolerance))
 
+    def _reaches(self, target: FocusTarget, tolerance: float) -> bool:
+        try:
+            return self.command(target)[1] <= tolerance
+        except TargetError:  # a conic of this curvature ends before the edge of the aperture
+            return False
+
     def _bisect(self, target: FocusTarget, near: float, far: float, tolerance: float) -> float:
-        """The reachable curvature between `near`, which is, and `far` next to that: one edge, as the programme is
-        convex.
-        """
+        """The reachable curvature between `near`, which is, and `far` next to that: by convexity there is one edge."""
         while abs(far - near) > 1e-5:
             middle = 0.5 * (near + far)
-            if self.command(target.with_curvature(middle))[1] <= tolerance:
-                near = middle
-            else:
-                far = middle
+            reached = self._reaches(target.with_curvature(middle), tolerance)
+            near, far = (middle, far) if reached else (near, middle)
         return near

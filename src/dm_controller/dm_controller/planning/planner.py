@@ -97,7 +97,7 @@ class Planner:
         self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
         self._closed_form = ClosedForm(mirror)
         self._prepared: PreparedInverse | None = None
-        self._limits = within(mirror.limits)
+        self._limits = within(mirror.limits) if hysteresis is not None else mirror.limits
         #: By check maps that the figure takes in.
         self.creep_shown: CreepShown | None = None
 
@@ -134,8 +134,12 @@ class Planner:
             TargetError: no such surface exists over the aperture.
         """
         mirror, law = self.mirror, self.law
+        cut = False
         if effective is None:
-            aim, largest = self._closed_form.find(target) or mirror.command(target)
+            found = self._closed_form.find(target)
+            aim, largest = found or mirror.command(target)
+            # By limits that are the signals' and not theirs: from here the signals may reach further, or less far.
+            cut = found is None and bool(mirror.limits.at_limit(aim).any())
         else:
             aim, largest = effective, mirror.predict(target, effective).max_zernike
         if error is not None:
@@ -148,8 +152,8 @@ class Planner:
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
         signals, missed = aim, None
-        if self.hysteresis is not None:
-            signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None)
+        if self.hysteresis is not None or effective is not None:
+            signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None, cut)
         reached = aim
         if missed is not None and np.abs(missed).max() > MISSED_MAX:
             if effective is None:
@@ -172,20 +176,27 @@ class Planner:
         return Move(target, signals, reached, largest, known, travel + ahead, predict)
 
     def _inverted(
-        self, state: HysteresisState, arrival: float, aim: Floats, ahead: float, target: FocusTarget | None
+        self,
+        state: HysteresisState,
+        arrival: float,
+        aim: Floats,
+        ahead: float,
+        target: FocusTarget | None,
+        cut: bool = False,
     ) -> tuple[Floats, Floats | None]:
         """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing.
 
-        Where the limits bind the signals are the nearest to `target`, or to the shape of `aim` without one.
+        Where the limits bind, or have `cut` the aim, the signals are the nearest to `target`, or to the shape of `aim`
+        without one.
         """
         limits, ready = self._limits, self._prepared
-        if ready is not None and ready.state is state:
+        if ready is not None and ready.state is state and not cut:
             found = ready.invert(arrival, aim, ahead)
             if found is not None:
                 return found, None
         at = self.law.advance(state, arrival)
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
-        if np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
+        if not cut and np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
             return inverted.signals, None
         wanted = self.mirror.matrix @ aim if target is None else self.mirror.rows(*self.mirror.wanted(target))
         signals, reached = self._constrained.solve(at, wanted, ahead, inverted.signals)
@@ -247,7 +258,7 @@ class Planner:
             rms_lower=rms_lower,
             rms_upper=rms_upper,
             max_zernike_upper=plan.max_zernike + math.hypot(largest_spread, crept),
-            saturated=self.mirror.limits.at_limit(signals),
+            saturated=self._limits.at_limit(signals),
             most=most,
         )
 

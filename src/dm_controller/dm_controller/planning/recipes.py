@@ -20,10 +20,14 @@ from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.recipes import RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.target import TARGET, FocusTarget
+from dm_controller.planning.target import TARGET, FocusTarget, Shape
 
 #: Surfaces whose coefficients differ less are the same shape, m.
 SAME_SHAPE = 3e-12
+#: Tilt at the edge, m, that recipes may have beyond what is wanted: a few tenths of a camera's pixel.
+SAME_TILT = 20e-9
+#: Effective signals that differ less are the same: a third of a DAC step.
+SAME_SIGNALS = 1e-5
 #: Distance of effective signals, rms over actuators, at which corrections are alike to 1/e. A sphere of 0.05 1/m and
 #: mid range are about 0.5 apart.
 REACH = 1.0
@@ -99,8 +103,10 @@ class Corrections:
         for shape in shapes:
             TARGET.check(shape)
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
-        self._own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
-        self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own
+        self._effective = np.array([recipe.effective for recipe in recipes])
+        own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
+        self._own = own + self._other_tilt(self._effective - own)
+        self._corrections = self._effective - self._own
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
         missed, left = self._kriging.left_out(self._corrections)
@@ -112,6 +118,18 @@ class Corrections:
         # The largest of a few samples is not the largest there is.
         self.amplitude = max(planner.error_bound(known=True), shown * (1.0 + 2.0 / len(recipes)))
         self._repeat = REPEAT_SHARE * held_out
+
+    def _other_tilt(self, added: Floats) -> Floats:
+        """(R, N) effective signals of the tilt in those that recipes added to the model's, (R, N), where it is none
+        that corrections bring along: they were built for another axis, or while tilt was free.
+        """
+        mirror, count = self._mirror, len(added)
+        if mirror.tilt is None:
+            return np.zeros_like(added)
+        tilt = mirror.tilt @ added.T
+        tilt[:, np.abs(tilt).max(axis=0) <= SAME_TILT] = 0.0
+        flat = Shape(np.zeros((len(TERMS), count)), np.zeros((len(mirror.model.sag_offset), count)))
+        return mirror.unlimited(flat, tilt).T
 
     def _surface(self, target: FocusTarget) -> Floats:
         """Coefficients beyond tilt, m."""
@@ -127,17 +145,24 @@ class Corrections:
         return np.asarray(np.abs(effective @ influence.T).max(axis=1))
 
     def find(self, target: FocusTarget) -> FoundRecipe:
-        """What makes `target`. Raises RecipeError when it is beyond all curvatures there are, or no recipe is near."""
-        surface = self._surface(target)
-        apart = np.abs(self._surfaces - surface).max(axis=1)
-        if apart.min() <= SAME_SHAPE:
-            recipe = self._recipes[int(apart.argmin())]
-            return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0))
+        """What makes `target`, its tilt by the model: no map measures that.
+
+        Raises:
+            RecipeError: it is beyond all curvatures there are, or no recipe is near.
+        """
+        own, apart = self._mirror.command(target)[0], np.abs(self._surfaces - self._surface(target)).max(axis=1)
+        if (same := np.flatnonzero(apart <= SAME_SHAPE)).size:
+            changes = own - self._own[same]
+            least = int(np.abs(changes).max(axis=1).argmin())
+            recipe, change = int(same[least]), changes[least]
+            measured = float(self._measured[recipe])
+            if np.abs(change).max() <= SAME_SIGNALS:
+                return FoundRecipe(self._effective[recipe], self._bound(measured, 0.0))
+            return FoundRecipe(self._effective[recipe] + change, self._bound(measured, self._kriging.at(own)[1]))
         curvatures = [recipe.curvature for recipe in self._recipes]
         inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
         if inside.deviation(target, self._mirror.model.aperture_radius) > SAME_SHAPE:
             raise RecipeError(f"curvature = {shape_text(target)}: nothing is extrapolated; there are {self._there()}")
-        own = self._mirror.command(target)[0]
         weights, left = self._kriging.at(own)
         if left > LEFT_MAX:
             raise RecipeError(

@@ -23,7 +23,12 @@ class TargetError(Refusal):
 
 
 MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
-_TARGET = {"curvature": real(0.0), "conic_constant": real(0.0), "zernike": reals([], sizes=(0, len(TERMS)))}
+#: Far beyond any mirror, and all that follows from them stays finite.
+_TARGET = {
+    "curvature": real(0.0, -1e6, 1e6, "1/m"),
+    "conic_constant": real(0.0, -1e9, 1e9),
+    "zernike": reals([], -1.0, 1.0, "m", sizes=(0, len(TERMS))),
+}
 #: What fields may be that a target is made of: those of a request, and those that it has itself.
 REQUEST = Fields(
     {

@@ -18,8 +18,8 @@ from dm_common.limits import SLACK, Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
-from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.planning.target import Shape
+from dm_controller.planning.mirror_model import InfluenceModel, target_shape
+from dm_controller.planning.target import FocusTarget, Shape
 
 #: Share by which an actuator may miss a move: hysteresis of such piezos ([1], section 1: about 10 %).
 MISS = 0.10
@@ -91,6 +91,10 @@ class Solver(ABC):
         """
         self._check(wanted)
         return self.limited(self._signals(self._start(), wanted - self.offset))
+
+    def command(self, target: FocusTarget) -> Command:
+        """Signals for `target`, without measuring. Raises TargetError when no such surface exists over the aperture."""
+        return self.solve(target_shape(target, self.model))
 
     def correct(self, signals: Floats, error: Shape) -> Command:
         """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step).

@@ -9,7 +9,8 @@ from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
-from dm_controller.solvers.base import Floats, Shape, Solver, miss_rows, normalised_terms, points_of
+from dm_controller.planning.target import FocusTarget
+from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, normalised_terms, points_of
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3
@@ -126,12 +127,17 @@ class Bounded(Solver):
     name = "bounded"
     source = "bounded quadratic programme ([9], chapter 23)"
 
-    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+    def __init__(self, model: InfluenceModel, limits: Limits, mirror: CalibratedMirror | None = None) -> None:
+        """`mirror`: of that model and those limits, which knows whether tilt is held and about which axis."""
         super().__init__(model, limits)
-        self._mirror = CalibratedMirror(model, limits)
+        self._mirror = mirror or CalibratedMirror(model, limits)
         # A correction must not pull at signals that the error says nothing of: its rows price moves, not signals.
         self._miss = miss_rows(self._mirror.matrix)
         self._correction = BoundedProgramme(np.vstack([self._mirror.matrix, self._miss]), limits, ridge=TINY**2)
+
+    def command(self, target: FocusTarget) -> Command:
+        """With the tilt that the target wants; corrections leave the tilt as it is."""
+        return Command(self._mirror.command(target)[0])
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
         # The programme bounds the signals themselves, so a change is asked for as the surface it leads to.

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 
 from dm_common.errors import UnknownNameError
 from dm_common.limits import Limits
-from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import AZreg, AZWreg, Bounded, IterativeLearning, PseudoInverse
 
@@ -31,15 +31,24 @@ def named(name: str, solvers: Collection[str]) -> str:
     return name
 
 
-def make_solver(name: str, model: InfluenceModel, limits: Limits, region_weights: ArrayLike | None = None) -> Solver:
+def make_solver(
+    name: str,
+    model: InfluenceModel,
+    limits: Limits,
+    region_weights: ArrayLike | None = None,
+    mirror: CalibratedMirror | None = None,
+) -> Solver:
     """The solver of that name ("" = the default) for one mirror.
 
     Args:
         region_weights: (10,) Eq. (8), for AZWreg; None = all equal.
+        mirror: see `Bounded`.
 
     Raises:
         UnknownNameError: no such method, listing all.
         ValueError: the model does not do for the method.
     """
     solver = SOLVERS[named(name, SOLVERS)]
+    if solver is Bounded:
+        return Bounded(model, limits, mirror)
     return AZWreg(model, limits, region_weights) if solver is AZWreg else solver(model, limits)
