@@ -40,8 +40,11 @@ class PlayedCamera:
     def focus_range(self) -> Any:
         return SimpleNamespace(curvature_min=-0.05, curvature_max=0.05)
 
-    def boresight(self, _region: Any, take_over: bool) -> Boresight:
-        assert not take_over
+    def wait(self, _condition: Any, _timeout_s: float) -> bool:
+        return True
+
+    def boresight(self, _region: Any, image_topic: str, take_over: bool) -> Boresight:
+        assert image_topic == "image_raw" and not take_over
         off = AXIS - self._held["optical_axis"] * (1 if self.still else -2)
         return Boresight(SCALE, SCALE @ off * RADIUS, np.full(2, 0.1))
 
@@ -63,7 +66,7 @@ def held(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def test_the_axis_is_held_and_written(held: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "mine.yaml"
-    dm_tools.boresight.run_boresight("", "0,0,1,1", False, target, None, None)
+    dm_tools.boresight.run_boresight("", "0,0,1,1", "image_raw", False, target, None, None)
     np.testing.assert_allclose(held["optical_axis"], AXIS)
     np.testing.assert_allclose(load_config(target)["focus_controller"]["optical_axis"], AXIS)
     assert "tilt free: -0.1000 to +0.1000 1/m, at most 8.0 nm rms" in capsys.readouterr().out
@@ -72,7 +75,7 @@ def test_the_axis_is_held_and_written(held: dict[str, Any], tmp_path: Path, caps
 def test_an_axis_that_makes_it_worse_is_not_kept(held: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PlayedCamera, "still", False)
     with pytest.raises(DeformableMirrorError, match="at one distance"):
-        dm_tools.boresight.run_boresight("", "0,0,1,1", False, None, None, None)
+        dm_tools.boresight.run_boresight("", "0,0,1,1", "image_raw", False, None, None, None)
     np.testing.assert_allclose(held["optical_axis"], 0)
 
 
@@ -81,14 +84,14 @@ def test_an_axis_that_was_not_seen_to_be_right_is_not_kept(
 ) -> None:
     see = PlayedCamera.boresight
 
-    def interrupted(camera: PlayedCamera, region: Any, take_over: bool) -> Boresight:
+    def interrupted(camera: PlayedCamera, region: Any, image_topic: str, take_over: bool) -> Boresight:
         if np.any(held["optical_axis"]):
             raise KeyboardInterrupt
-        return see(camera, region, take_over)
+        return see(camera, region, image_topic, take_over)
 
     monkeypatch.setattr(PlayedCamera, "boresight", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        dm_tools.boresight.run_boresight("", "0,0,1,1", False, None, None, None)
+        dm_tools.boresight.run_boresight("", "0,0,1,1", "image_raw", False, None, None, None)
     np.testing.assert_allclose(held["optical_axis"], 0)
 
 

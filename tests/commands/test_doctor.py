@@ -281,7 +281,9 @@ def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
     running = Finding("virtual_bench, pdm_driver, in the ROS domain 0", "")
     held = held_by_the_nodes("electronics at 127.0.0.1:1", refused, running._asdict())
     assert held is not None and held.note and held.problem == refused.problem and "./dm status" in held.cure
-    for check, others in (("electronics at 127.0.0.1:1", alone), ("watched folder /maps", running)):
+    without = Finding("running: calibration; not running: pdm_driver (nothing can move the mirror)", "start it", True)
+    told = (("electronics at 127.0.0.1:1", alone), ("electronics at 1", without), ("watched folder /maps", running))
+    for check, others in told:
         assert held_by_the_nodes(check, refused, others._asdict()) == refused
 
 

@@ -348,6 +348,8 @@ def test_commands_are_held_back() -> None:
     assert replayed(topics, ["zernike"]) == ["/zernike"]
     with pytest.raises(ValueError, match="/nothing: not in the recording"):
         replayed(topics, ["nothing"])
+    with pytest.raises(ValueError, match="/focus_request: a command, which is published with --commands only"):
+        replayed(topics, ["focus_request"])
 
 
 def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain: int, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from dm_autofocus.focus_probe import IMAGES, raw_image
 from dm_autofocus.images import grey, pixels_of
 from dm_autofocus.sharpness import check_region, cut
 from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
+from dm_client.fields import filled
 from dm_common.errors import ErrorCode
 from dm_common.messages import seconds as seconds_of
 from dm_common.optics.zernike import PISTON_TILT, TERMS
@@ -50,14 +51,14 @@ class CameraFocusClient(DeformableMirrorClient):
         self, distance: float, *, dry_run: bool = False, **claim: Unpack[Claim]
     ) -> SetFocusDistance.Response:
         """Focus on an object at `distance` (m; 0 or inf = infinity)."""
-        request = SetFocusDistance.Request(distance=float(distance), dry_run=dry_run, **claim)
+        request = filled(SetFocusDistance.Request, distance=distance, dry_run=dry_run, **claim)
         return self.call("set_focus_distance", request)
 
     def focus_dioptre(
         self, dioptre: float, *, dry_run: bool = False, **claim: Unpack[Claim]
     ) -> SetFocusDistance.Response:
         """Focus on 1 / distance (1/m; 0 = infinity), as libcamera and Android count."""
-        request = SetFocusDistance.Request(dioptre=float(dioptre), dry_run=dry_run, **claim)
+        request = filled(SetFocusDistance.Request, dioptre=dioptre, dry_run=dry_run, **claim)
         return self.call("set_focus_distance", request)
 
     def autofocus(
@@ -79,7 +80,7 @@ class CameraFocusClient(DeformableMirrorClient):
             timeout_s: longest time the search may take.
             claim: where somebody holds the mirror.
         """
-        goal = Autofocus.Goal(region=[float(value) for value in region], **claim)
+        goal = filled(Autofocus.Goal, region=region, **claim)
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
 
@@ -93,7 +94,7 @@ class CameraFocusClient(DeformableMirrorClient):
         **claim: Unpack[Claim],
     ) -> None:
         """Search the sharpest focus in a region as `autofocus`, and stay on it for so many seconds."""
-        goal = Autofocus.Goal(region=[float(value) for value in region], track=True, **claim)
+        goal = filled(Autofocus.Goal, region=region, track=True, **claim)
         ends = math.inf
 
         def follow(feedback: Any) -> None:
@@ -130,7 +131,7 @@ class CameraFocusClient(DeformableMirrorClient):
             The result; an image that is sharp everywhere, (H, W, channels) in the camera's encoding; distances [m],
             (H, W): NaN = not known, inf = infinity or beyond the far end of the range, -inf = nearer than its near end.
         """
-        goal = FocusStack.Goal(images=images, **claim)
+        goal = filled(FocusStack.Goal, images=images, **claim)
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         topics = ("focus_stack/image", "focus_stack/depth")
         for topic in topics:
@@ -139,12 +140,15 @@ class CameraFocusClient(DeformableMirrorClient):
         image, depth = (pixels_of(self.stamped(topic, result.stamp)) for topic in topics)
         return result, image, depth[..., 0]
 
-    def boresight(self, region: Sequence[float], *, pairs: int = 6, **claim: Unpack[Claim]) -> Boresight:
+    def boresight(
+        self, region: Sequence[float], *, pairs: int = 6, image_topic: str = "image_raw", **claim: Unpack[Claim]
+    ) -> Boresight:
         """Measure how the picture moves with the mirror's tilt and with the focus; ends at the focus of the region.
 
         Args:
             region: left, top, width, height as shares 0..1 of the image: an object that stands still.
             pairs: images on either side of the focus, in turns.
+            image_topic: of the camera, as `autofocus` takes it; with /compressed behind it too.
             claim: where somebody holds the mirror.
 
         Raises:
@@ -155,7 +159,7 @@ class CameraFocusClient(DeformableMirrorClient):
         reach = self.focus_range()
         step = STEP * reach.curvature_tolerance
         focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
-        topics = {"image_raw": Image, "image_raw/compressed": CompressedImage}
+        topics = {image_topic: Image, f"{image_topic}/compressed": CompressedImage}
         for topic, kind in topics.items():
             self.hear(topic, kind, IMAGES)
 
@@ -170,7 +174,9 @@ class CameraFocusClient(DeformableMirrorClient):
                 return [image for image in came if seconds_of(image.header.stamp) >= begin]
 
             if not self.wait(lambda: bool(fresh())):
-                raise DeformableMirrorError(ErrorCode.TIMEOUT, "no image on image_raw that was stamped after a move")
+                raise DeformableMirrorError(
+                    ErrorCode.TIMEOUT, f"no image on {image_topic} that was stamped after a move"
+                )
             return cut(grey(raw_image(fresh()[0])), part)
 
         try:

@@ -130,20 +130,23 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def companions_of(values: Mapping[str, str], aggregation: Path, camera: bool = False) -> list[dict[str, Any]]:
+def companions_of(
+    values: Mapping[str, str], aggregation: Path, camera: bool = False, pushed: str = ""
+) -> list[dict[str, Any]]:
     """Keyword arguments of the launch actions that start what others offer beside the suite.
 
     Args:
         values: of LAUNCH_ARGUMENTS, as text.
         aggregation: parameter file of the aggregator.
         camera: whether the simulation has one.
+        pushed: namespace that all of this is launched in.
 
     Raises:
         ValueError: as `arguments_of`.
     """
     found: list[dict[str, Any]] = []
     places = {"mirror": values["place"]} if values["place"] else {}
-    prefix = f"{values['namespace'].strip('/')}/".lstrip("/")
+    prefix = "".join(f"{part.strip('/')}/" for part in (pushed, values["namespace"]) if part.strip("/"))
     if camera:
         places["camera_optical"] = f"{OPTICAL} {prefix}camera_link"
     for child, place in places.items():

@@ -58,7 +58,9 @@ def start_nodes(context):
         actions.append(action)
     aggregation = Path(get_package_share_directory("dm_bringup")) / "launch" / "diagnostics.yaml"
     camera = config.get("virtual_bench", {}).get("camera.rate", 0.0) > 0.0
-    return actions + [Node(output="screen", **others) for others in companions_of(values, aggregation, camera)]
+    pushed = LaunchConfiguration("ros_namespace", default="").perform(context)  # PushRosNamespace around this file
+    companions = companions_of(values, aggregation, camera, pushed)
+    return actions + [Node(output="screen", **others) for others in companions]
 
 
 def brought_up(action):

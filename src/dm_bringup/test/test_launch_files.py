@@ -116,6 +116,9 @@ def test_the_place_of_the_mirror_and_what_others_offer() -> None:
     ]
     assert bridge["package"] == "foxglove_bridge" and Path(aggregator["parameters"][0]).is_file()
     assert companions_of(DEFAULTS, SHARE) == []
+    (pushed, _bridge) = companions_of(given, SHARE, pushed="/robot1")
+    child = pushed["arguments"].index("--child-frame-id") + 1
+    assert pushed["arguments"][child] == "robot1/left/mirror" and pushed["namespace"] == given["namespace"]
     (optical,) = companions_of(DEFAULTS, SHARE, camera=True)
     assert optical["arguments"][-4:] == ["--frame-id", "camera_link", "--child-frame-id", "camera_optical"]
     assert optical["arguments"][6:12] == ["--yaw", "-1.5707963", "--pitch", "0", "--roll", "-1.5707963"]

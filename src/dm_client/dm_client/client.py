@@ -27,6 +27,7 @@ from dm_msgs.srv import (
 from sensor_msgs.msg import Image
 
 from dm_client.connection import RESTING, WATCHED, Connection, DeformableMirrorError, Watched
+from dm_client.fields import filled
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 
@@ -71,7 +72,7 @@ class DeformableMirrorClient(Connection):
     """Talk to one mirror's nodes. Use as a context manager.
 
     Args:
-        namespace: of the mirror, "" for none.
+        namespace: of the mirror, "" for none; that of the process it runs in does not count.
         domain: ROS domain; None = the environment's.
         timeout_s: how long to wait for a service that should answer at once.
     """
@@ -144,9 +145,8 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> FocusState:
         """Set the surface curvature [1/m] (concave positive) and return the prediction; `dry_run` moves nothing."""
-        request = _request(curvature, conic_constant, claim)
-        request.zernike = list(zernike)
-        return self.call("set_focus", SetFocus.Request(request=request, dry_run=dry_run)).state
+        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, zernike=zernike, **claim)
+        return self.call("set_focus", filled(SetFocus.Request, request=request, dry_run=dry_run)).state
 
     def focus_power(self, power: float, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Set the optical power [dioptre] = 2 x surface curvature."""
@@ -154,13 +154,13 @@ class DeformableMirrorClient(Connection):
 
     def flatten(self, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Make the surface as flat as the mirror can."""
-        return self.call("flatten", Flatten.Request(dry_run=dry_run, **claim)).state
+        return self.call("flatten", filled(Flatten.Request, dry_run=dry_run, **claim)).state
 
     def set_signals(
         self, signals: Sequence[float], *, wait: bool = True, **claim: Unpack[Claim]
     ) -> SetSignals.Response:
         """Set all actuator signals (normalised, -1..+1)."""
-        return self.call("set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait, **claim))
+        return self.call("set_signals", filled(SetSignals.Request, signals=signals, wait=wait, **claim))
 
     def degauss(
         self,
@@ -171,15 +171,15 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> Degauss.Result:
         """Remove the hysteresis and end at mid range; `steps` half-swings, 0 = as configured in the driver."""
-        return self.run_action("degauss", Degauss.Goal(steps=steps, **claim), on_feedback, timeout_s)
+        return self.run_action("degauss", filled(Degauss.Goal, steps=steps, **claim), on_feedback, timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
         """Take one map with the interferometer."""
-        return self.call("measure", Measure.Request(label=label), timeout_s)
+        return self.call("measure", filled(Measure.Request, label=label), timeout_s)
 
     def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:
         """Read one map file."""
-        return self.call("ingest_file", IngestFile.Request(path=path), timeout_s)
+        return self.call("ingest_file", filled(IngestFile.Request, path=path), timeout_s)
 
     def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
@@ -196,7 +196,7 @@ class DeformableMirrorClient(Connection):
 
     def load_calibration(self, name: str = "") -> LoadCalibration.Response:
         """Load a stored calibration; "" = the newest that fits."""
-        return self.call("load_calibration", LoadCalibration.Request(calibration=name))
+        return self.call("load_calibration", filled(LoadCalibration.Request, calibration=name))
 
     def update_calibration(
         self,
@@ -212,9 +212,7 @@ class DeformableMirrorClient(Connection):
         `forget` takes no map but drops all earlier updates. `without` are numbers, from 1, of actuators that do not
         move any more: from now on they count as without effect, standing where the map shows them.
         """
-        if not all(0 < number < 1 << 16 for number in without):  # the message would hold no others
-            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"without = {list(without)}: numbers count from 1")
-        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget, without=list(without), **claim)
+        request = filled(UpdateCalibration.Request, dry_run=dry_run, forget=forget, without=without, **claim)
         return self.call("update_calibration", request, timeout_s)
 
     # --- actions ---
@@ -232,7 +230,7 @@ class DeformableMirrorClient(Connection):
     ) -> MoveFocus.Result:
         """Move to a curvature and return when the shape stands."""
         request = _request(curvature, conic_constant, claim)
-        goal = MoveFocus.Goal(request=request, tolerance=float(tolerance), settle_time=float(settle_time))
+        goal = filled(MoveFocus.Goal, request=request, tolerance=tolerance, settle_time=settle_time)
         return self.run_action("move_focus", goal, on_feedback, timeout_s)
 
     def converge(
@@ -249,7 +247,7 @@ class DeformableMirrorClient(Connection):
     ) -> Converge.Result:
         """Close the loop on the interferometer until the measured surface is the requested one."""
         request = _request(curvature, conic_constant, claim)
-        goal = Converge.Goal(request=request, method=method, tolerance=float(tolerance), max_maps=max_maps)
+        goal = filled(Converge.Goal, request=request, method=method, tolerance=tolerance, max_maps=max_maps)
         return self.run_action("converge", goal, on_feedback, timeout_s)
 
     def build_recipes(
@@ -265,9 +263,9 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> BuildRecipes.Result:
         """Build a recipe for each curvature [1/m] on the bench, with `zernike` [m] added; they are stored."""
-        shapes = {"curvatures": list(map(float, curvatures)), "zernike": list(map(float, zernike))}
-        goal = BuildRecipes.Goal(
-            **shapes, conic_constant=float(conic_constant), tolerance=float(tolerance), max_maps=max_maps, **claim
+        shapes = {"curvatures": curvatures, "zernike": zernike}
+        goal = filled(
+            BuildRecipes.Goal, **shapes, conic_constant=conic_constant, tolerance=tolerance, max_maps=max_maps, **claim
         )
         return self.run_action("build_recipes", goal, on_feedback, timeout_s)
 
@@ -282,4 +280,4 @@ class DeformableMirrorClient(Connection):
 
 
 def _request(curvature: float, conic_constant: float, claim: Claim) -> FocusRequest:
-    return FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant), **claim)
+    return filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)

@@ -9,8 +9,10 @@ from typing import Any
 
 import rclpy
 from dm_msgs.msg import Calibration, Capabilities, MirrorInfo, SurfaceMapInfo
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_namespace import validate_namespace
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
@@ -102,9 +104,17 @@ class Connection:
         timeout_s: float = 10.0,
         watched: Watched = WATCHED,
     ) -> None:
+        place, own = f"/{namespace.strip('/')}", f"{name}_{os.getpid()}_{next(_NUMBERS)}"
+        try:
+            validate_namespace(place)
+        except InvalidNamespaceException as error:
+            text = f"namespace = {namespace!r}: {str(error).splitlines()[0]}"
+            raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node(f"{name}_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
+        # A launched process may be told another name and namespace, which are those of its own node.
+        rules = ["--ros-args", "-r", f"__node:={own}", "-r", f"__ns:={place}"]
+        self.node = Node(own, namespace=place, context=self._context, cli_args=rules)
         self.messages: dict[str, Any] = {}
         self._heard: set[str] = set()
         self._on_message, self._timeout_s = on_message, timeout_s

@@ -7,8 +7,9 @@ import numpy as np
 import typer
 
 from dm_common.errors import ErrorCode
-from dm_tools.output import console, next_step, write_json
+from dm_tools.output import NotRunningError, console, next_step, write_json
 from dm_tools.parameter_changes import get_parameter, set_parameter, source_of, write_parameters
+from dm_tools.running_suite import BUSY_S, nodes_of_suite
 
 #: A picture that moves by less over the range stands still [px].
 STILL_PX = 0.5
@@ -41,7 +42,13 @@ def price(client: Any, axis: Any) -> dict[str, Any]:
 
 
 def run_boresight(
-    namespace: str, region: str, take_over: bool, write: Path | None, config: Path | None, json: Path | None
+    namespace: str,
+    region: str,
+    image_topic: str,
+    take_over: bool,
+    write: Path | None,
+    config: Path | None,
+    json: Path | None,
 ) -> None:
     """Find the camera's axis, have the focus controller keep the picture there, and see whether it stands still.
 
@@ -53,6 +60,8 @@ def run_boresight(
 
     part = region_of(region)
     with CameraFocusClient(namespace) as client:
+        if not client.wait(lambda: nodes_of_suite(client), BUSY_S):
+            raise NotRunningError("no node of the suite is heard: start them (./dm up --camera, or your launch file)")
         source = source_of(write, config, client.mirror_info.serial) if write is not None else None
         reach = client.focus_range()
         span = reach.curvature_max - reach.curvature_min
@@ -60,7 +69,7 @@ def run_boresight(
         def moved() -> tuple[Any, float, float]:
             """What was found, by how much the picture moves over the range, and its standard deviation, px."""
             with console.status("tip, tilt and focus, to and fro"):
-                found = client.boresight(part, take_over=take_over)
+                found = client.boresight(part, image_topic=image_topic, take_over=take_over)
             return found, float(span * np.hypot(*found.drift)), float(span * np.hypot(*found.drift_sigma))
 
         axis = np.array(get_parameter(client, "focus_controller", "optical_axis"))

@@ -40,7 +40,24 @@ JsonOption = Annotated[
 TakeOverOption = Annotated[
     bool, typer.Option("--take-over", help="Even if somebody else holds the mirror: their run ends.")
 ]
-NamespaceOption = Annotated[str, typer.Option("--namespace", help="Namespace of the mirror, one per mirror.")]
+
+
+def checked_namespace(namespace: str) -> str:
+    """`namespace`, where it can be one. Raises typer.BadParameter."""
+    from rclpy.exceptions import InvalidNamespaceException
+    from rclpy.validate_namespace import validate_namespace
+
+    try:
+        validate_namespace(f"/{namespace.strip('/')}")  # "/" = none
+    except InvalidNamespaceException as error:
+        raise typer.BadParameter(f"--namespace {namespace!r}: {str(error).splitlines()[0]}") from error
+    return namespace
+
+
+NamespaceOption = Annotated[
+    str,
+    typer.Option("--namespace", help="Namespace of the mirror, one per mirror.", callback=checked_namespace),
+]
 
 
 class NotRunningError(RuntimeError):

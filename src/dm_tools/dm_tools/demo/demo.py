@@ -13,8 +13,9 @@ from dm_tools.demo.demo_bench import (
     Hysteresis,
     bench_config,
     identify_hysteresis,
-    new_folder,
+    make_empty,
     running_bench,
+    usable_folder,
     wait_for_calibration,
 )
 from dm_tools.output import (
@@ -168,6 +169,8 @@ def demo(
     if camera:
         from dm_tools.demo.demo_camera import demo_camera
 
+        if config_file or map_file or keep_maps:
+            raise typer.BadParameter("--camera and --config, --map or --keep-maps: the camera has a bench of its own")
         demo_camera(hysteresis.value, creep, seed, speed, out, json)
         return
     from dm_msgs.action import Calibrate
@@ -178,8 +181,11 @@ def demo(
     from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
     started = time.monotonic()
-    folder = new_folder(out)
-    config = bench_config(folder, hysteresis.value, creep, seed, speed, config_file)
+    folder = usable_folder(out)
+    if map_file is not None and (not map_file.is_file() or map_file.resolve().is_relative_to(folder)):
+        raise ValueError(f"--map {map_file}: must be a file outside of the folder {out}, which is emptied")
+    config = bench_config(folder, hysteresis.value, creep, seed, speed, config_file)  # before that: it may be in there
+    make_empty(folder)
     name = config["pdm_driver"].get("mirror.name", "PDM30-37")
     figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": creep, "seed": seed}
     with own_domain() as domain:

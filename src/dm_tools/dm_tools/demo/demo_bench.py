@@ -14,6 +14,8 @@ from typing import Any
 
 #: A port of the virtual bench that is not offered.
 OFF = -1
+#: In the folder of a demo.
+MARK = ".dm_demo"
 #: Above those that Linux by default hands out to whoever asks for any (net.ipv4.ip_local_port_range).
 PORTS = range(61000, 65536)
 #: Parameters of a bench whose actuators follow one law.
@@ -106,13 +108,20 @@ def bench_config(
     return config
 
 
-def new_folder(path: Path) -> Path:
-    """An empty folder; what was there before is gone."""
+def usable_folder(path: Path) -> Path:
+    """The folder of a demo, absolute. Raises ValueError where something else than a demo has left anything there."""
     folder = path.resolve()
+    if folder.exists() and not (folder.is_dir() and ((folder / MARK).is_file() or not any(folder.iterdir()))):
+        raise ValueError(f"--out {path}: is there, and not of a demo, which begins with an empty folder: name another")
+    return folder
+
+
+def make_empty(folder: Path) -> None:
+    """Make `folder`, see `usable_folder`, anew; what a demo before has left is gone."""
     if folder.exists():
         shutil.rmtree(folder)
-    folder.mkdir(parents=True)
-    return folder
+    (folder / "maps").mkdir(parents=True)
+    (folder / MARK).write_text("made by dm demo, which empties this folder when it begins\n")
 
 
 @contextlib.contextmanager

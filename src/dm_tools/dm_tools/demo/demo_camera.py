@@ -13,7 +13,14 @@ from dm_autofocus.sharpness import Region
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.camera_runs import Focused, Recorder, focus_on, follow, sweep_of
-from dm_tools.demo.demo_bench import bench_config, identify_hysteresis, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.demo_bench import (
+    bench_config,
+    identify_hysteresis,
+    make_empty,
+    running_bench,
+    usable_folder,
+    wait_for_calibration,
+)
 from dm_tools.demo.pictures import save_animation, save_contact_sheet
 from dm_tools.output import console, next_step, write_json
 from dm_tools.verbs import calibrate
@@ -74,7 +81,8 @@ def show(found: list[Focused], depth: float) -> None:
 def demo_camera(law: str, creep: float, seed: int, speed: float, out: Path, json: Path | None) -> None:
     """Calibrate in fast time, then start again in real time with a camera and focus on every object."""
     started = time.monotonic()
-    folder = new_folder(out)
+    folder = usable_folder(out)
+    make_empty(folder)
     console.print(f"virtual bench with a camera: PDM30-37, hysteresis {law}, creep {creep:.0%}, seed {seed}")
     with own_domain() as domain:
         config = bench_config(folder, law, creep, seed, speed)

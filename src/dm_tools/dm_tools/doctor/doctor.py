@@ -47,6 +47,7 @@ def doctor(
 
 def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:
     """What a check has found, which is no more than a note where the nodes of the bench run and hold it."""
-    if finding is None or not check.startswith(EXCLUSIVE) or "pdm_driver" not in (running or {}).get("problem", ""):
+    heard = (running or {}).get("problem", "").partition("; not running")[0]
+    if finding is None or not check.startswith(EXCLUSIVE) or "pdm_driver" not in heard:
         return finding
     return finding._replace(cure="none, if that is for the nodes that run; ./dm status says how they are", note=True)

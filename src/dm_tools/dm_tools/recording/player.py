@@ -25,12 +25,14 @@ DISCOVERY_S = 1.0
 def replayed(topics: Sequence[str], names: Sequence[str] = (), commands: bool = False) -> list[str]:
     """Which of `topics` are published: `names`, or all but commands, hidden and housekeeping ones.
 
-    Raises ValueError for a name that is not in the recording.
+    Raises ValueError for a name that is not in the recording, or of a command that must not be published.
     """
     wanted = [name if name.startswith("/") else f"/{name}" for name in names]
     for name in wanted:
         if name not in topics:
             raise ValueError(f"topic {name}: not in the recording, which has {', '.join(sorted(topics))}")
+        if not commands and name.rsplit("/", 1)[-1] in COMMANDS:
+            raise ValueError(f"topic {name}: a command, which is published with --commands only")
     chosen = wanted or [name for name in topics if "/_" not in name and name not in HOUSEKEEPING]
     return [name for name in chosen if commands or name.rsplit("/", 1)[-1] not in COMMANDS]
 

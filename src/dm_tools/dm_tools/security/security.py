@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from dm_tools.output import JsonOption, console, fail, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, fail, write_json
 
 
 def security(
     out: Annotated[Path | None, typer.Option(help="Write policies, governance and environment to this folder.")] = None,
     check: Annotated[Path | None, typer.Option(help="Compare this keystore with the profile.")] = None,
-    namespace: Annotated[str, typer.Option(help="Namespace of the mirror.")] = "",
+    namespace: NamespaceOption = "",
     domain: Annotated[int, typer.Option(min=0, max=232, help="ROS domain of the bench.")] = 0,
     simulation: Annotated[
         bool, typer.Option("--simulation", help="With the virtual bench, which publishes the clock.")

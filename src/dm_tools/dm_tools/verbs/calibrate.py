@@ -183,6 +183,9 @@ def calibrate(
     region: Annotated[
         str, typer.Option(help="With --boresight: left, top, width, height of what stands still, as shares.")
     ] = "0.25,0.25,0.5,0.5",
+    image_topic: Annotated[
+        str, typer.Option(help="With --boresight: the camera's topic, as the node autofocus has it.")
+    ] = "image_raw",
     write: Annotated[
         Path | None,
         typer.Option(help="Write what a poke check or --boresight finds into this copy of the parameter file."),
@@ -207,8 +210,12 @@ def calibrate(
     from dm_client import DeformableMirrorError
     from dm_tools.boresight import run_boresight
 
+    if config is not None and write is None:
+        raise typer.BadParameter("--config without --write: only that needs to know the file of the nodes")
     if boresight:
-        run_boresight(namespace, region, take_over, write, config, json)
+        if dry_run or fresh or until or note or surfaces or amplitude or hysteresis is not None or not activate:
+            raise typer.BadParameter("--boresight takes no option of a calibration: it moves the mirror, by images")
+        run_boresight(namespace, region, image_topic, take_over, write, config, json)
         return
     if (hysteresis is not None or until) and plan != CalibrationPlan.hysteresis:
         option = "--until" if until else "--hysteresis"
@@ -257,9 +264,9 @@ def calibrate(
         show_result(result, calibration)
         if until:
             console.print(next((part for part in result.message.split("; ") if REACHED.search(part)), ""))
-    write_json(json, {"calibration": figures_of(result)})
     if write is not None and source is not None:
         write_parameters(result.parameters, write, source)
+    write_json(json, {"calibration": figures_of(result)})
     if dry_run:
         next_step("the same without --dry-run measures")
     elif then := after_run(result, write):

@@ -28,20 +28,18 @@ def focus(
     with running_suite(namespace) as client, naming_holder(client):
         try:
             state = client.focus(wanted, conic, dry_run=True)
-        except DeformableMirrorError as error:
-            if error.response is not None:
-                write_json(
-                    json, {"focus": [{"curvature": wanted, "error_code": error.error_code, "message": str(error)}]}
-                )
-            raise
-        _show(state, _calibration(client))
-        if not dry_run:
-            if wait:
+            _show(state, _calibration(client))
+            if not dry_run and wait:
                 result = client.move_focus(wanted, conic, take_over=take_over)
                 state = result.state
                 console.print(f"the shape stands after {result.duration * 1e3:.0f} ms{_held(state)}")
-            else:
+            elif not dry_run:
                 state = client.focus(wanted, conic, take_over=take_over)
+        except DeformableMirrorError as error:
+            if error.response is not None:
+                refused = {"curvature": wanted, "error_code": error.error_code, "message": str(error)}
+                write_json(json, {"focus": [refused]})
+            raise
     write_json(json, {"focus": [figures_of(state)]})
     _show_next(state)
 

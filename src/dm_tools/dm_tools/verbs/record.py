@@ -1,6 +1,7 @@
 """`dm record`: the topics of a session in an MCAP file that `ros2 bag` and Foxglove read."""
 
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+from dm_tools.output import JsonOption, NamespaceOption, NotRunningError, console, write_json
 
 #: How often the count on the screen is renewed, s.
 SHOWN_EVERY_S = 0.5
@@ -55,6 +56,7 @@ def record(
         console.print(f"[yellow]not recorded[/] {name}: {reason}")
     console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
     if not any(count for name, count in counts.items() if name != PARAMETER_EVENTS):
-        raise RuntimeError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
+        shutil.rmtree(folder)
+        raise NotRunningError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
     seconds = time.monotonic() - started
     write_json(json, {"folder": str(folder), "messages": counts, "refused": recorder.refused, "seconds": seconds})

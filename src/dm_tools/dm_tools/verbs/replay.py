@@ -38,8 +38,13 @@ def replay(
     for name in bag.unfinished:
         console.print(f"[yellow]remark[/] {name} was not finished: what is whole in it is read")
     if recalibrate:
-        write_json(json, _again(bag, run, namespace, store, config))
+        figures = _again(bag, run, namespace, store, config)
+        write_json(json, figures)
+        if figures["identical"] is False:
+            raise RuntimeError("the calibration made again is not the one that was recorded")
         return
+    if run or store or config:
+        raise typer.BadParameter("--run, --store and --config are for --recalibrate")
     names = replayed(list(bag.topics), [name.strip() for name in topics.split(",") if name.strip()], commands)
     console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
     with progress_bar() as bar:
@@ -88,8 +93,6 @@ def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path 
     if store is not None:
         file = str(folder.save(calibration))
         console.print(f"stored: {file}")
-    if differing:
-        raise RuntimeError("the calibration made again is not the one that was recorded")
     return {
         "maps": len(calibration.maps),
         "in_sample_rms_nm": nanometres(fit.in_sample_rms),

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_bringup.suite import Config, load_config
-from dm_tools.output import console, next_step
+from dm_tools.output import checked_namespace, console, next_step
 
 #: A suite that is not ready after this is said to be late, s.
 LATE_S = 30.0
@@ -48,7 +48,11 @@ def up(
         ),
     ] = None,
     namespace: Annotated[
-        list[str] | None, typer.Option(help="Namespace of the mirror; several times for as many mirrors.")
+        list[str] | None,
+        typer.Option(
+            help="Namespace of the mirror; several times for as many mirrors.",
+            callback=lambda names: [checked_namespace(name) for name in names] if names else names,
+        ),
     ] = None,
     camera: Annotated[
         bool,

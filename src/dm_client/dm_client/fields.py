@@ -1,0 +1,62 @@
+"""Messages from what Python programs have at hand: NumPy scalars, paths, lists of either."""
+
+import operator
+import os
+from collections.abc import Callable
+from typing import Any
+
+from dm_client.connection import DeformableMirrorError
+from dm_common.errors import ErrorCode
+
+
+def _text(value: Any) -> str:
+    text = os.fspath(value)
+    if not isinstance(text, str):
+        raise TypeError("bytes")
+    return text
+
+
+#: How a value becomes one of this type; TypeError or ValueError where it cannot.
+_CONVERTED: dict[str, Callable[[Any], Any]] = {
+    "boolean": bool,
+    "double": float,
+    "string": _text,
+    **{f"{sign}int{bits}": operator.index for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
+
+
+def filled(kind: Any, **values: Any) -> Any:
+    """A message, request or goal with these fields, converted to their types.
+
+    rclpy ends the whole process at a value of another type: the generated code asserts.
+
+    Raises:
+        DeformableMirrorError: INVALID_ARGUMENT or OUT_OF_RANGE, naming the field, its value and what it must be.
+    """
+    types = kind.get_fields_and_field_types()
+    return kind(**{name: _field(name, value, types[name]) for name, value in values.items()})
+
+
+def _field(name: str, value: Any, type_name: str) -> Any:
+    element = type_name.removeprefix("sequence<").rstrip(">")
+    if element not in _CONVERTED:  # a message
+        return value
+    try:
+        if element != type_name:
+            return [_one(name, each, element) for each in value]
+        return _one(name, value, element)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, DeformableMirrorError):
+            raise
+        text = f"{name} = {value!r}: must be {type_name.replace('boolean', 'true or false')}"
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
+
+
+def _one(name: str, value: Any, type_name: str) -> Any:
+    made = _CONVERTED[type_name](value)
+    if "int" in type_name:
+        bits = int(type_name.partition("int")[2])
+        low, high = (0, 2**bits - 1) if type_name.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        if not low <= made <= high:
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"{name} = {made}: must be {low} to {high}")
+    return made

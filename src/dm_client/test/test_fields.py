@@ -1,0 +1,65 @@
+"""What Python programs give a client, and what becomes of it in a message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.action import BuildRecipes, Degauss
+from dm_msgs.srv import IngestFile, Measure, SetFocus, SetSignals, UpdateCalibration
+
+from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_client.fields import filled
+from dm_common.errors import ErrorCode
+
+
+def test_what_means_the_same_is_taken() -> None:
+    """rclpy would end the process at each of them."""
+    assert filled(Degauss.Goal, steps=np.int64(12), take_over=np.bool_(True)) == Degauss.Goal(steps=12, take_over=True)
+    assert filled(IngestFile.Request, path=Path("/a.dat")).path == "/a.dat"
+    assert filled(SetFocus.Request, dry_run=1).dry_run is True
+    signals = filled(SetSignals.Request, signals=np.array([0.5, -1], dtype=np.float32), wait=0).signals
+    assert list(signals) == [0.5, -1.0]
+    assert list(filled(UpdateCalibration.Request, without=np.array([3, 5])).without) == [3, 5]
+    assert filled(BuildRecipes.Goal, curvatures=(1, np.float32(0.5))) == BuildRecipes.Goal(curvatures=[1.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "code", "text"),
+    [
+        (Degauss.Goal, {"steps": -1}, ErrorCode.OUT_OF_RANGE, r"steps = -1: must be 0 to \d+"),
+        (Degauss.Goal, {"steps": 1.5}, ErrorCode.INVALID_ARGUMENT, r"steps = 1.5: must be uint32"),
+        (Measure.Request, {"label": 3}, ErrorCode.INVALID_ARGUMENT, "label = 3: must be string"),
+        (IngestFile.Request, {"path": b"/a"}, ErrorCode.INVALID_ARGUMENT, "path = b'/a': must be string"),
+        (UpdateCalibration.Request, {"without": [-1]}, ErrorCode.OUT_OF_RANGE, "without = -1: must be 0 to"),
+        (UpdateCalibration.Request, {"without": 5}, ErrorCode.INVALID_ARGUMENT, "without = 5: must be sequence"),
+        (SetSignals.Request, {"signals": ["a"]}, ErrorCode.INVALID_ARGUMENT, "signals = .'a'.: must be sequence"),
+    ],
+)
+def test_what_is_no_such_thing_is_refused_by_name(kind: Any, fields: dict[str, Any], code: int, text: str) -> None:
+    with pytest.raises(DeformableMirrorError, match=text) as refused:
+        filled(kind, **fields)
+    assert refused.value.error_code == code
+
+
+@pytest.mark.parametrize("namespace", ["1bad", "my mirror", "a//b"])
+def test_a_namespace_that_cannot_be_is_refused(namespace: str) -> None:
+    with pytest.raises(DeformableMirrorError, match="namespace = ") as refused:
+        DeformableMirrorClient(namespace)
+    assert refused.value.error_code == ErrorCode.INVALID_ARGUMENT
+
+
+@pytest.mark.parametrize(("namespace", "place"), [("left", "/left"), ("/left/", "/left"), ("", "/")])
+def test_a_client_in_a_launched_process_talks_to_the_mirror_that_it_is_for(
+    namespace: str, place: str, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What launch calls the user's own node, and where that is, is not the client's."""
+    told = ["vision", "--ros-args", "-r", "__ns:=/right", "-r", "__node:=my_vision", "-r", "image_raw:=/camera/image"]
+    monkeypatch.setattr("sys.argv", told)
+    with DeformableMirrorClient(namespace, domain) as client:
+        assert client.node.get_namespace() == place
+        assert client.node.get_name().startswith("dm_client_")
+        assert client.node.resolve_service_name("set_focus") == f"{place.rstrip('/')}/set_focus"
+        assert client.node.resolve_topic_name("image_raw") == "/camera/image"
