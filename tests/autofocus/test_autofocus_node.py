@@ -89,7 +89,8 @@ class FilmedScene:
         self.request = self.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.node.create_subscription(FocusRequest, "focus_request", self._on_request, qos.COMMAND)
         WorkerService(self.node, SetFocus, "set_focus", self._on_set_focus)
-        WorkerService(self.node, HoldMirror, "hold_mirror", lambda _request, response: response)
+        self.taken_over = False
+        WorkerService(self.node, HoldMirror, "hold_mirror", self._on_hold)
         self.states: list[AutofocusState] = observer.record(AutofocusState, "autofocus_state", qos.STATE)
         self._stop = threading.Event()
         self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)
@@ -164,6 +165,11 @@ class FilmedScene:
                 self._curvature, self._pending = request.curvature, state
                 self._stands_at = time.monotonic() + MOVE_TIME
         self._state.publish(state)
+
+    def _on_hold(self, request: HoldMirror.Request, response: HoldMirror.Response) -> HoldMirror.Response:
+        if self.taken_over and request.operation == HoldMirror.Request.RENEW:
+            response.error_code, response.message = ErrorCode.BUSY, "taken over by calibration"
+        return response
 
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
         self.asked.append(request.request)
@@ -480,6 +486,18 @@ def test_tracking_goes_on_when_the_controller_is_back(scene: FilmedScene, observ
     assert scene.states[-1].phase == AutofocusState.PHASE_TRACK and not result.done()
     handle.cancel_goal_async()
     wait_until(result.done, what="the end after cancel")
+
+
+def test_tracking_that_stands_still_hears_that_somebody_took_the_mirror_over(start: Start, observer: Observer) -> None:
+    with FilmedScene(observer, object_curvature=0.0173) as played:
+        start("dm_autofocus", "autofocus", {**PARAMETERS, "track.dither": 0.0})
+        played.until_known(observer)
+        _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+        wait_until(lambda: played.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+        played.taken_over = True
+        wait_until(result.done, 30, "the end")
+        assert result.result().result.error_code == ErrorCode.PREEMPTED
+        assert "taken over by calibration" in result.result().result.message
 
 
 def test_another_node_that_moves_the_mirror_ends_the_search(scene: FilmedScene, observer: Observer) -> None:

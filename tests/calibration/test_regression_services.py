@@ -29,6 +29,7 @@ from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
+from dm_common.ros.worker import WorkerService
 from dm_controller.forecast import ForecastClient, hysteresis_share, surface_control_error_rms
 from dm_controller.planning.mirror_model import CalibratedMirror
 from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes
@@ -254,6 +255,40 @@ def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, obs
     assert client.share is share
     client.use(None, 2e-8)
     assert client.share is None
+
+
+def test_a_refusal_that_passes_does_not_end_the_forecast(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The calibration node may be inactive while its calibration is in use."""
+    monkeypatch.setattr("dm_controller.forecast.RETRY_S", 0.2)
+    codes = [ErrorCode.NODE_INACTIVE]
+
+    def predict(_request: Any, response: Any) -> Any:
+        response.error_code, response.message = codes[-1], "as the node is now"
+        response.lower, response.upper = 1e-9, 2e-9
+        return response
+
+    WorkerService(observer.node, PredictError, "predict_error", predict)
+    model = influence_model(calibrated()[1], RADIUS)
+    mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
+    active: Any = SimpleNamespace(
+        calibration=SimpleNamespace(id="one"),
+        planner=SimpleNamespace(hysteresis=None),
+        mirror=mirror,
+        reachable_range=lambda target, tolerance: (-0.02, 0.02),
+    )
+    client = ForecastClient(observer.node)
+
+    def refused() -> bool:
+        client.use(active, 2e-8)
+        return bool(client._told)
+
+    def known() -> bool:
+        client.use(active, 2e-8)
+        return client.share is not None
+
+    wait_until(refused, 30)
+    codes.append(ErrorCode.OK)
+    wait_until(known, 30)
 
 
 def test_share_of_the_hysteresis() -> None:

@@ -251,3 +251,19 @@ def test_recipes_beyond_the_tolerance_are_stored_and_named(rig: Rig) -> None:
     assert (result.error_code, result.recipes) == (ErrorCode.NOT_CONVERGED, 1)
     assert "not within the tolerance of 0.00 nm: +0.0200 1/m" in result.message
     assert rig.stored[0].recipes.recipes[0].max_zernike == result.max_zernike > 1e-14
+
+
+def test_maps_of_a_mirror_whose_history_was_lost_make_no_recipe(rig: Rig) -> None:
+    """The electronics lose power in a map, and are back before the next shape: on another branch of the loops."""
+    measured = rig.bench.plant.sag
+
+    def cut(signals: Any) -> Any:
+        if len(rig.bench.measured) == 2:
+            rig.bench.history_known = False
+            rig.bench.publish_state()
+        return measured(signals)
+
+    rig.bench.plant.sag = cut  # type: ignore[method-assign,assignment]
+    status, result = rig.run(recipes(0.01))
+    assert status == GoalStatus.STATUS_ABORTED and result.error_code == ErrorCode.DRIVER_UNAVAILABLE
+    assert "no longer knows what the actuators went through" in result.message and not rig.stored

@@ -285,6 +285,8 @@ class FocusProbe:
         with self._changed:
             while True:
                 check()
+                if self.user and self._hold.lost is not None:
+                    raise self._hold.lost
                 if condition():
                     return True
                 if self._other_request is not None:

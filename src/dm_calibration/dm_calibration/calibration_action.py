@@ -83,6 +83,8 @@ class CalibrateAction:
                 self._run_kept(runs)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
+        finally:
+            self._services.cancelled = lambda: False  # a goal that has ended ends nobody else's waits
         result.maps_dropped = len(result.dropped)
         result.duration = (clock.now() - started).nanoseconds * 1e-9
         if result.error_code == ErrorCode.OK:

@@ -143,7 +143,9 @@ class CalibrationNode(ManagedNode):
         except ValueError as error:
             self.get_logger().error(f"mirror_info refused: {error}")
             return
-        self._driver_facts = driver_facts(message)
+        self._driver_facts, before = driver_facts(message), self._manager.mirror
+        if before is not None and before.serial != mirror.serial:
+            self._listener.history.forget()
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"

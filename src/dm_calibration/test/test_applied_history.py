@@ -169,3 +169,19 @@ def test_another_number_of_signals_starts_anew(history: AppliedHistory, driver: 
         driver.report(2.0)
     with pytest.raises(MapNotUsableError, match="no report so old"):
         history.settled(5.0, 1.0)
+
+
+def test_what_another_mirror_held_is_not_held_against_this_one(history: AppliedHistory) -> None:
+    """Its creep of hours went on in the calibration node, and maps of the next mirror were refused as surprising."""
+    fresh = AppliedHistory()
+    history.follow(CREEPING)
+    before = Driver(history)
+    before.degauss(1.0)
+    before.go(10.0, 0.8)
+    before.report(36_000.0)
+    history.forget()
+    for followed in (history, fresh):
+        followed.follow(replace(CREEPING, creep_rate=0.021))
+        Driver(followed).degauss(40_000.0)
+    forgotten, expected = (each.settled(40_010.0, 1.0).effective for each in (history, fresh))
+    np.testing.assert_allclose(forgotten, expected, atol=1e-12)

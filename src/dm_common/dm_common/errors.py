@@ -101,6 +101,12 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> UnknownNameError
     return UnknownNameError(f"{what} {name!r} is unknown" + (hint if names else ""))
 
 
+class ClockError(CodedError, TimeoutError):
+    """ROS time stands still."""
+
+    error_code = ErrorCode.TIMEOUT
+
+
 #: Failures that are answered with a code and a message; anything else is a defect.
 EXPECTED = (CodedError, ValueError)
 

@@ -52,12 +52,16 @@ class Conditioning:
         self.order: Order | None = None
         self._number = 0
         self._learnt: dict[int, float] = {}
+        self._learnt_at = (math.nan, math.nan)  # slew rate and half the range
 
     def duration(self, steps: int, active: ActiveCalibration) -> float:
         """Time in s that a degauss of `steps` half-swings (0 = as the driver does) takes; 0 = not known.
 
         As the last one took; before the first from the way, which is half the span per half-swing, and the slew rate.
         """
+        at = active.planner.slew_rate, active.mirror.limits.half_range
+        if at != self._learnt_at:  # another mirror, or another configuration
+            self._learnt, self._learnt_at = {}, at
         if steps in self._learnt:
             return self._learnt[steps]
         for known, seconds in self._learnt.items():

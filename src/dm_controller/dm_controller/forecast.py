@@ -26,6 +26,8 @@ from dm_controller.planning.target import FocusTarget, Shape
 GRID = 11
 #: Answers that have not come within this time are asked for again, s: the node that was asked may have died.
 RETRY_S = 10.0
+#: Answers that no later one differs from.
+FINAL = (ErrorCode.TOO_FEW_MAPS, ErrorCode.NOT_SUPPORTED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ class ForecastClient:
         self._client = node.create_client(PredictError, "predict_error")
         self._calibration_id = ""
         self._asked_at = -float("inf")
-        self._refused = False
+        self._refused, self._told = False, ""
         self._pending: list[Any] = []
 
     def use(self, active: ActiveCalibration | None, tolerance: float) -> None:
@@ -129,9 +131,10 @@ class ForecastClient:
             return
         answer = future.result()
         if answer.error_code != ErrorCode.OK:
-            if not self._refused:
+            if answer.message != self._told:
+                self._told = answer.message
                 self._node.get_logger().info(f"no prediction of the surface error: {answer.message}")
-            self._refused = True
+            self._refused = answer.error_code in FINAL
             return
         answers[row] = answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():

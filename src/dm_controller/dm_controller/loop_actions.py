@@ -56,6 +56,7 @@ class LoopBench(BenchServices):
         self._host, self.parameters = node, values
         self._goal = threading.Lock()
         self._needed: qos.Liveliness | None = None
+        self._by_history = False
 
     def run(
         self,
@@ -65,6 +66,7 @@ class LoopBench(BenchServices):
         asked: Any,
         body: Callable[[], tuple[int, str]],
         needed: qos.Liveliness | None = None,
+        history: bool = False,
     ) -> tuple[str, int, str]:
         """Outcome, ErrorCode and sentence of a goal of the action `name`, which has the bench for itself.
 
@@ -74,13 +76,14 @@ class LoopBench(BenchServices):
             asked: says who asks, see `BenchServices.held`.
             body: carries the goal out.
             needed: a node that the goal needs besides driver and interferometer.
+            history: whether a map counts only where the driver knows the actuators' history as it did before.
         """
         busy = "a closed loop or a run of recipes is under way; cancel it first, or take the mirror over"
         timeout = self.parameters["converge.driver_timeout"]
         try:
             self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
             try:
-                self._values, self._needed = loop_times(self.parameters), needed
+                self._values, self._needed, self._by_history = loop_times(self.parameters), needed, history
                 self.settle_time = self._values["settle_time"]
                 self.cancelled = lambda: bool(handle.is_cancel_requested)
                 self.publish_waits(handle, feedback)
@@ -90,8 +93,6 @@ class LoopBench(BenchServices):
                 self._goal.release()
         except EXPECTED as error:
             code, text = error_code(error), str(error)
-        except TimeoutError as error:
-            code, text = ErrorCode.TIMEOUT, str(error)
         # One line per severity: rclpy ties a severity to the line that logs.
         if code == ErrorCode.OK:
             self._node.get_logger().info(f"{name}: {text}")
@@ -124,7 +125,7 @@ class LoopBench(BenchServices):
         return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
 
     def check_ready(self) -> None:
-        """As of the driver, and wait until ROS time runs. Raises TimeoutError where it does not."""
+        """As of the driver, and wait until ROS time runs. Raises ClockError where it does not."""
         super().check_ready()
         wait_for_clock(self._node.get_clock())
 
@@ -146,7 +147,10 @@ class LoopBench(BenchServices):
         left = int(self.parameters["converge.measure_retries"])
         while True:
             try:
-                return super().measure(label)
+                measured = super().measure(label)
+                if self._by_history:
+                    self.check_history()
+                return measured
             except MeasurementError:
                 if left == 0 or self.cancelled():
                     raise

@@ -589,6 +589,11 @@ def test_a_degauss_on_the_way(bench: Bench) -> None:
     assert not order.pending and bench.controller.monitor.progress(order, bench.time).stands
     active = bench.controller.active
     assert active is not None and bench.controller.conditioning.duration(0, active) == 2.0
+    slower = copy(MIRROR)
+    slower.slew_rate_max = 0.01 * MIRROR.slew_rate_max
+    bench.do(bench.controller.use(calibration(), slower))  # what was learnt of the faster one says nothing
+    active = bench.controller.active
+    assert active is not None and bench.controller.conditioning.duration(0, active) > 50.0
 
 
 def test_a_degauss_on_the_way_takes_the_mirror_over_where_its_request_does(bench: Bench) -> None:

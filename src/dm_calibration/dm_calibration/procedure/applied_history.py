@@ -45,6 +45,10 @@ class AppliedHistory:
         """Follow `law` from now on, and through what was heard before; None = no hysteresis."""
         self._observer.use(law or HysteresisModel.linear(), middle)
 
+    def forget(self) -> None:
+        """Another mirror is there: of its actuators nothing is known."""
+        self._observer.recall(None, another=True)
+
     def observe(self, report: Applied) -> None:
         """Take the driver's next report.
 

@@ -67,7 +67,7 @@ class MapListener:
         self._node, self._values = node, values
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
-        self._history = AppliedHistory()
+        self.history = AppliedHistory()
         self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
@@ -106,7 +106,7 @@ class MapListener:
         law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
         if law is not self._law:  # recipes may have been added to the same calibration
             self._law = law
-            self._history.follow(law, middle)
+            self.history.follow(law, middle)
 
     def amend(self, message: CalibrationMsg) -> None:
         """Put what maps have shown since into the message of the calibration in use."""
@@ -160,7 +160,7 @@ class MapListener:
         if not len(message.applied):
             return
         try:
-            self._history.observe(applied_from(message, 1e-9 * self._node.get_clock().now().nanoseconds))
+            self.history.observe(applied_from(message, 1e-9 * self._node.get_clock().now().nanoseconds))
         except ValueError as error:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 
@@ -202,12 +202,12 @@ class MapListener:
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
         measured = replace(measured, temperature=self._temperatures.at(at))
-        if not _becomes(lambda: self._history.heard_since(at + still), REPORT_WAIT_S):
+        if not _becomes(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
-        verdict = self._updates.take(measured, self._history.settled(at, still), dry_run, without)
+        verdict = self._updates.take(measured, self.history.settled(at, still), dry_run, without)
         if not dry_run:
             self._taken += verdict.accepted
             if not verdict.accepted:
@@ -271,7 +271,7 @@ class MapListener:
 
     def _rests(self) -> bool:
         now = 1e-9 * self._node.get_clock().now().nanoseconds
-        return self._history.still_for(now) >= self._values["updates.still_time"]
+        return self.history.still_for(now) >= self._values["updates.still_time"]
 
     def _calibration(self) -> Calibration:
         if (kept := self._updates.in_use) is None:

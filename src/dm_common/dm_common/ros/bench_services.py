@@ -151,10 +151,7 @@ class BenchServices:
         return np.array(response.applied) if len(response.applied) == len(signals) else signals
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
-        try:
-            slept = sleep(self._node.get_clock(), share * self.settle_time + dwell, self._stopping)
-        except TimeoutError as error:
-            raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
+        slept = sleep(self._node.get_clock(), share * self.settle_time + dwell, self._stopping)
         if self.hold.lost is not None:
             raise self.hold.lost
         return slept

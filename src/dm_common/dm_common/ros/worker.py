@@ -19,7 +19,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
 
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, ClockError, ErrorCode, Refusal, error_code
 from dm_common.messages import answer_with
 from dm_common.ros import qos
 from dm_common.ros.executor import PatientActionServer, until_discovered
@@ -273,12 +273,12 @@ def wait_for_clock(clock: Clock) -> None:
     """Wait in a worker thread until ROS time runs: simulated time stands at 0 until the first message on /clock.
 
     Raises:
-        TimeoutError: no time within CLOCK_S.
+        ClockError: no time within CLOCK_S.
     """
     deadline = time.monotonic() + CLOCK_S
     while clock.now().nanoseconds == 0:
         if time.monotonic() > deadline:
-            raise TimeoutError(f"use_sim_time is set, but nothing came on /clock within {CLOCK_S:g} s")
+            raise ClockError(f"use_sim_time is set, but nothing came on /clock within {CLOCK_S:g} s")
         time.sleep(0.01)
 
 
@@ -286,7 +286,7 @@ def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: 
     """Sleep in ROS time (which may run faster than the wall clock) in a worker thread.
 
     Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
-    raises TimeoutError after 10 s plus ten times `seconds` of wall time.
+    raises ClockError after 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
     end = clock.now() + Duration(nanoseconds=round(seconds * 1e9))
@@ -295,6 +295,6 @@ def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: 
         if cancelled():
             return False
         if time.monotonic() > give_up:
-            raise TimeoutError(f"ROS time did not advance by {seconds:g} s; is the publisher of /clock alive?")
+            raise ClockError(f"ROS time did not advance by {seconds:g} s; is the publisher of /clock alive?")
         time.sleep(min(remaining, 0.002 if remaining < 0.02 or clock.ros_time_is_active else 0.02))
     return not cancelled()

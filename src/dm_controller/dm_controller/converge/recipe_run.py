@@ -53,7 +53,7 @@ class RecipeRun:
             return self._build_and_store(handle, feedback, result)
 
         outcome, result.error_code, result.message = self._bench.run(
-            "build_recipes", handle, feedback, handle.request, body, self._calibration
+            "build_recipes", handle, feedback, handle.request, body, self._calibration, history=True
         )
         return outcome, result
 
@@ -160,7 +160,8 @@ class RecipeRun:
             except ServiceCallError as error:
                 code, text = ErrorCode.TIMEOUT, gone() or str(error)
                 wait = True
-            if not wait or handle.is_cancel_requested or time.monotonic() > deadline:
+            lost = self._bench.hold.lost is not None  # somebody else wants the bench, which this does not need
+            if not wait or lost or handle.is_cancel_requested or time.monotonic() > deadline:
                 return code, text
             self._bench.waiting(f"waiting: {text}")
             time.sleep(0.1)
