@@ -179,6 +179,19 @@ def test_a_recipe_has_the_tilt_that_a_move_has(hold_tilt: bool) -> None:
                 assert found.error > as_built.error
 
 
+@pytest.mark.parametrize("share", [0.5, 0.97])
+def test_a_recipe_whose_tilt_a_limit_has_cut_is_replayed_as_it_was_measured(share: float) -> None:
+    """Where limits bind tilt is given up first, which does not make it a recipe of another axis."""
+    x, y = hexagon()
+    planner = Planner(CalibratedMirror(replace(MODEL, actuator_x=x, actuator_y=y), LIMITS, axis=(3e-3, 0.0)))
+    target = FocusTarget(share * planner.mirror.reachable_range(FocusTarget(0.0), 20e-9)[1])
+    plant = LinearPlant(GAINS)
+    recipe = RecipeBuilder(planner, plant, lambda: plant.time, BuildOptions(1e-9, reachable=1e-6)).build(target)
+    found = Corrections(recipe_book([recipe], planner, 100, 0), planner).find(target)
+    np.testing.assert_array_equal(found.effective, recipe.effective)
+    assert found.error < 2.0 * max(recipe.max_zernike, 1e-9)
+
+
 def test_cancelling_stops_between_two_maps() -> None:
     plant = LinearPlant(GAINS)
     builder = RecipeBuilder(LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3)

@@ -88,14 +88,13 @@ class FocusProbe:
         self.target = math.nan
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, while held [1/m]
-        self._measuring = False
-        self._apart = 0.0  # the stamps of the latest two images [s]
+        self._degauss_s = 0.0  # that the latest move waits for
+        self._measuring, self._apart = False, 0.0  # and the stamps of the latest two images, by so much [s]
         self._fresh: Image | CompressedImage | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._hold = MirrorHolder(node, node.get_name())
-        self._node = node
+        self._node, self.topic = node, ""
         self._images: Any = None
-        self.topic = ""
         node.create_subscription(CameraInfo, "camera_info", self._on_camera_info, IMAGES)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
@@ -140,8 +139,10 @@ class FocusProbe:
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
-                if message.applied or message.error_code != ErrorCode.OK:  # else it waits for a degauss that runs
+                if message.applied or message.error_code != ErrorCode.OK:
                     self.answer = self.answer or message
+                else:
+                    self._degauss_s = message.predicted_duration  # it waits for a degauss that runs
             elif message.applied and message.curvature not in self._asked:
                 self._other_request = message.curvature
             self._changed.notify_all()
@@ -213,7 +214,7 @@ class FocusProbe:
             raise self._hold.lost
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
-            self.answer = None
+            self.answer, self._degauss_s = None, 0.0
             self.target = curvature
             self._asked.append(curvature)
         mode, holder, gone = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
@@ -294,6 +295,6 @@ class FocusProbe:
                         ErrorCode.PREEMPTED,
                         f"another node asked for a curvature of {self._other_request:+.4f} 1/m meanwhile",
                     )
-                if time.monotonic() > deadline:
+                if time.monotonic() > deadline + self._degauss_s:
                     return False
                 self._changed.wait(0.05)  # `check` gives no notice

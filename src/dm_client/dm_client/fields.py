@@ -16,9 +16,15 @@ def _text(value: Any) -> str:
     return text
 
 
+def _flag(value: Any) -> bool:
+    if value not in (0, 1):  # no text, which would be true whatever it says
+        raise ValueError("neither true nor false")
+    return bool(value)
+
+
 #: How a value becomes one of this type; TypeError or ValueError where it cannot.
 _CONVERTED: dict[str, Callable[[Any], Any]] = {
-    "boolean": bool,
+    "boolean": _flag,
     "double": float,
     "string": _text,
     **{f"{sign}int{bits}": operator.index for sign in ("", "u") for bits in (8, 16, 32, 64)},
@@ -34,6 +40,8 @@ def filled(kind: Any, **values: Any) -> Any:
         DeformableMirrorError: INVALID_ARGUMENT or OUT_OF_RANGE, naming the field, its value and what it must be.
     """
     types = kind.get_fields_and_field_types()
+    if unknown := values.keys() - types.keys():
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, f"{', '.join(sorted(unknown))}: no such field")
     return kind(**{name: _field(name, value, types[name]) for name, value in values.items()})
 
 
@@ -43,6 +51,8 @@ def _field(name: str, value: Any, type_name: str) -> Any:
         return value
     try:
         if element != type_name:
+            if isinstance(value, str | bytes):
+                raise TypeError("text")
             return [_one(name, each, element) for each in value]
         return _one(name, value, element)
     except (TypeError, ValueError) as error:

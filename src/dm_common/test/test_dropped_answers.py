@@ -133,6 +133,8 @@ def test_a_request_that_was_lost_is_sent_once_more_where_it_may_be_carried_out_t
     losses = 10
     with pytest.raises(ServiceCallError, match=r"no answer within 0\.5 s"):
         call(client, Trigger.Request(), timeout_s=0.5, again_s=0.1)
+    wait_until(lambda: len(lost) >= 4)
+    time.sleep(0.3)
     assert len(lost) == 4  # once more, not for ever
     served.destroy_node()
 

@@ -141,6 +141,7 @@ class LoopBench(BenchServices):
     def degauss(self, steps: int = 0) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""
         super().degauss(steps or int(self.parameters["recipes.degauss_steps"]))
+        self._history_known = self._by_history  # from here on: what is lost before the first map counts as well
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""

@@ -251,7 +251,7 @@ def test_recipes_whose_answer_was_lost_are_stored_again(monkeypatch: pytest.Monk
     monkeypatch.setattr(recipe_run.time, "sleep", lambda _duration: None)
     said: list[str] = []
     alive: Any = SimpleNamespace(wait_for_return=lambda _stop: None, since_now=lambda _served: lambda: "")
-    bench: Any = SimpleNamespace(waiting=said.append, parameters={})
+    bench: Any = SimpleNamespace(waiting=said.append, parameters={}, hold=SimpleNamespace(lost=None))
     store: Any = SimpleNamespace(service_is_ready=lambda: True)
     run = recipe_run.RecipeRun(bench, store, alive)
     handle: Any = SimpleNamespace(is_cancel_requested=False)

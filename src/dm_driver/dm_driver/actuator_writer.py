@@ -45,8 +45,11 @@ class ActuatorWriter(WriterThread):
         if move is None or not written:
             return written
         assert known is not None
-        # A command that came meanwhile is as good: the way to it is a ramp too.
-        return move.wait(timeout_s + self._limiter.ramp_time(known, self._safe_shape)) in _UNDER_CONTROL
+        limit = time.monotonic() + timeout_s + self._limiter.ramp_time(known, self._safe_shape)
+        # Without a link nobody waits for what goes on when it is back.
+        while (outcome := move.wait(0.02)) is None and self._link_up and time.monotonic() < limit:
+            pass
+        return outcome in _UNDER_CONTROL  # a command that came meanwhile is as good: the way to it is a ramp too
 
     def _known_shape(self) -> Shape | None:
         """Where the outputs stand, as far as anybody can know; None = unknown."""

@@ -396,7 +396,7 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
         assert writer.wait_for_link(5)
         writer.enable(0.0)
         wait_until(lambda: len(unit.frames) > 2)
-        move = writer.command(shape(0.9)) if commanded else None
+        move = writer.command(shape(-0.9)) if commanded else None
         unit.unplug()
         wait_until(lambda: not writer.state().link_up)
         lost, frames = writer.state(), len(unit.frames)
@@ -408,6 +408,7 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
             assert move.wait(5) is Outcome.LINK_LOST
             wait_until(lambda: writer.state().link_up)
             assert writer.state().moving is None
+            wait_until(lambda: len(unit.frames) > frames)
             assert signals_of(unit.frames[-1:]) == pytest.approx(lost.applied[0], abs=CODE)
 
 

@@ -65,9 +65,15 @@ def call(
         time.sleep(0.02)
     done = threading.Event()
 
+    answers: list[Any] = []
+
+    def answered(future: Any) -> None:
+        answers.append(future.result())
+        done.set()
+
     def send() -> Any:
         future = client.call_async(request)
-        future.add_done_callback(lambda _future: done.set())
+        future.add_done_callback(answered)
         return future
 
     future, again = send(), time.monotonic() + again_s
@@ -76,10 +82,10 @@ def call(
             client.remove_pending_request(future)
             reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
             raise ServiceCallError(f"{client.srv_name}: {reason}")
-        if time.monotonic() > again and not future.done():
+        if time.monotonic() > again:
             client.remove_pending_request(future)
             future, again = send(), math.inf
-    return future.result()
+    return answers[0]
 
 
 class ThreadedActionClient(ActionClient):

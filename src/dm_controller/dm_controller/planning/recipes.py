@@ -105,7 +105,7 @@ class Corrections:
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
         own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
-        self._own = own + self._other_tilt(self._effective - own)
+        self._own = own + self._other_tilt(own)
         self._corrections = self._effective - self._own
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
@@ -119,15 +119,16 @@ class Corrections:
         self.amplitude = max(planner.error_bound(known=True), shown * (1.0 + 2.0 / len(recipes)))
         self._repeat = REPEAT_SHARE * held_out
 
-    def _other_tilt(self, added: Floats) -> Floats:
-        """(R, N) effective signals of the tilt in those that recipes added to the model's, (R, N), where it is none
-        that corrections bring along: they were built for another axis, or while tilt was free.
+    def _other_tilt(self, own: Floats) -> Floats:
+        """(R, N) effective signals of the tilt in what recipes added to the model's `own` (R, N), where it is none that
+        corrections bring along, nor that a limit has cut: they were built for another axis, or while tilt was free.
         """
-        mirror, count = self._mirror, len(added)
+        mirror, count = self._mirror, len(own)
         if mirror.tilt is None:
-            return np.zeros_like(added)
-        tilt = mirror.tilt @ added.T
-        tilt[:, np.abs(tilt).max(axis=0) <= SAME_TILT] = 0.0
+            return np.zeros_like(own)
+        tilt, at_limit = mirror.tilt @ (self._effective - own).T, mirror.limits.at_limit
+        cut = [(at_limit(one) | at_limit(other)).any() for one, other in zip(own, self._effective, strict=True)]
+        tilt[:, np.array(cut) | (np.abs(tilt).max(axis=0) <= SAME_TILT)] = 0.0
         flat = Shape(np.zeros((len(TERMS), count)), np.zeros((len(mirror.model.sag_offset), count)))
         return mirror.unlimited(flat, tilt).T
 

@@ -96,7 +96,7 @@ async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
 async def load(session: Session, name: str) -> str:
     """Use a stored calibration."""
     answer = await session.ros.call("load_calibration", LoadCalibration.Request(calibration=name), 30.0)
-    return f"{answer.id} is in use"
+    return str(answer.message)
 
 
 def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:

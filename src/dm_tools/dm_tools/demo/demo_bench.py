@@ -112,7 +112,10 @@ def usable_folder(path: Path) -> Path:
     """The folder of a demo, absolute. Raises ValueError where something else than a demo has left anything there."""
     folder = path.resolve()
     if folder.exists() and not (folder.is_dir() and ((folder / MARK).is_file() or not any(folder.iterdir()))):
-        raise ValueError(f"--out {path}: is there, and not of a demo, which begins with an empty folder: name another")
+        raise ValueError(
+            f"--out {path}: is there, and not of a demo, which begins with an empty folder: name another, or delete it "
+            "(earlier versions left no mark)"
+        )
     return folder
 
 

@@ -16,8 +16,8 @@ from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, ne
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 
 
-def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any]]:
-    """File of the calibration that the running suite uses, and the parameters that a report is judged by there.
+def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], str]:
+    """File of the calibration that the running suite uses, what a report is judged by there, and of which mirror.
 
     No file: it has none, or runs elsewhere. The parameters as they are by default: nothing runs.
     """
@@ -28,16 +28,16 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any]]:
 
     with DeformableMirrorClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), FIND_S):
-            return None, DEFAULTS
+            return None, DEFAULTS, ""
         client.wait(lambda: "calibration" in client.messages, BUSY_S)
         message = client.messages.get("calibration")
         if message is None:
-            return None, DEFAULTS
+            return None, DEFAULTS, ""
         values = DEFAULTS
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)
             values = {name: get_parameter(client, "calibration", name) for name in JUDGED_BY}
         file = Path(message.file)
-        return file if message.file and file.is_file() else None, values
+        return file if message.file and file.is_file() else None, values, message.mirror_serial
 
 
 def newest_store(folders: Sequence[Path]) -> Path:
@@ -99,9 +99,10 @@ def report(
 ) -> None:
     """Write the report of a calibration: what was measured with what, how good it is, and what limits it.
 
-    Reads the stored file; needs no running nodes, but judges by the parameters of those that run.
+    Reads the stored file; needs no running nodes, but goes by the parameters of those that run for that mirror.
     """
     from dm_calibration.report.certificate import keep_people, people
+    from dm_calibration.report.checks import DEFAULTS
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
 
@@ -109,11 +110,13 @@ def report(
     folder = out.resolve()
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
-    file_in_use, values = running_calibration(namespace)
+    file_in_use, values, serial = running_calibration(namespace)
     if store is None:
         calibration = calibration or str(file_in_use or "")
         store = folder_with(calibration, STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
+    if found.mirror_serial != serial:
+        values = DEFAULTS  # another mirror's limits are none of this one
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
     if console.is_terminal and sys.stdin.isatty():
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
