@@ -145,6 +145,7 @@ PARSED = {
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm calibrate --boresight": "needs a camera; test_boresight_command.py runs what it does, test_held_tilt.py how",
+    "./dm calibrate --boresight --image-topic /camera/image_raw": "the same, with another topic",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
     "./dm instrument retrace tilt*.dat": "test_instrument_errors.py runs it on maps of the virtual bench",
     "./dm instrument grid marks.csv any.dat": "test_instrument_errors.py runs it on maps of the virtual bench",
