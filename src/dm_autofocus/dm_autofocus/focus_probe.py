@@ -88,7 +88,7 @@ class FocusProbe:
         self.target = math.nan
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, while held [1/m]
-        self._degauss_s = 0.0  # that the latest move waits for
+        self._degauss_s = 0.0  # of a degauss that the latest move waits for
         self._measuring, self._apart = False, 0.0  # and the stamps of the latest two images, by so much [s]
         self._fresh: Image | CompressedImage | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
@@ -139,10 +139,10 @@ class FocusProbe:
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
-                if message.applied or message.error_code != ErrorCode.OK:
+                answered = message.applied or message.error_code != ErrorCode.OK  # else a degauss runs first
+                self._degauss_s = 0.0 if answered else message.predicted_duration
+                if answered:
                     self.answer = self.answer or message
-                else:
-                    self._degauss_s = message.predicted_duration  # it waits for a degauss that runs
             elif message.applied and message.curvature not in self._asked:
                 self._other_request = message.curvature
             self._changed.notify_all()
