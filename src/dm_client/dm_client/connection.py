@@ -74,6 +74,17 @@ def checked(response: Any) -> Any:
     return response
 
 
+def full_namespace(namespace: str) -> str:
+    """A namespace from the root on; "/" = none. Raises DeformableMirrorError where it cannot be one."""
+    place = f"/{namespace.strip('/')}"
+    try:
+        validate_namespace(place)
+    except InvalidNamespaceException as error:
+        text = f"namespace = {namespace!r}: {str(error).splitlines()[0]}"
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
+    return place
+
+
 class Connection:
     """A node that hears topics and calls the nodes of one mirror, once it is started.
 
@@ -104,12 +115,7 @@ class Connection:
         timeout_s: float = 10.0,
         watched: Watched = WATCHED,
     ) -> None:
-        place, own = f"/{namespace.strip('/')}", f"{name}_{os.getpid()}_{next(_NUMBERS)}"
-        try:
-            validate_namespace(place)
-        except InvalidNamespaceException as error:
-            text = f"namespace = {namespace!r}: {str(error).splitlines()[0]}"
-            raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
+        place, own = full_namespace(namespace), f"{name}_{os.getpid()}_{next(_NUMBERS)}"
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         # A launched process may be told another name and namespace, which are those of its own node.

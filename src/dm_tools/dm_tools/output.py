@@ -44,13 +44,14 @@ TakeOverOption = Annotated[
 
 def checked_namespace(namespace: str) -> str:
     """`namespace`, where it can be one. Raises typer.BadParameter."""
-    from rclpy.exceptions import InvalidNamespaceException
-    from rclpy.validate_namespace import validate_namespace
+    if namespace:  # a command without one does not wait for this
+        from dm_client import DeformableMirrorError
+        from dm_client.connection import full_namespace
 
-    try:
-        validate_namespace(f"/{namespace.strip('/')}")  # "/" = none
-    except InvalidNamespaceException as error:
-        raise typer.BadParameter(f"--namespace {namespace!r}: {str(error).splitlines()[0]}") from error
+        try:
+            full_namespace(namespace)
+        except DeformableMirrorError as error:
+            raise typer.BadParameter(f"--{error}") from error
     return namespace
 
 
