@@ -228,15 +228,19 @@ def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path:
     assert any("epsilon 400 nm^2 given" in sentence for sentence in limitations), limitations
 
 
-def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, observer: Observer) -> None:
+def without_hysteresis(identifier: str) -> Any:
+    """A calibration in use that does not know the hysteresis itself."""
     model = influence_model(calibrated()[1], RADIUS)
-    mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
-    active: Any = SimpleNamespace(
-        calibration=SimpleNamespace(id="whole"),
+    return SimpleNamespace(
+        calibration=SimpleNamespace(id=identifier),
         planner=SimpleNamespace(hysteresis=None),
-        mirror=mirror,
+        mirror=CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0)),
         reachable_range=lambda target, tolerance: (-0.02, 0.02),
     )
+
+
+def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, observer: Observer) -> None:
+    active = without_hysteresis("whole")
     client = ForecastClient(observer.node)
     assert client.share is None
     load(observer, "whole")
@@ -268,14 +272,7 @@ def test_a_refusal_that_passes_does_not_end_the_forecast(observer: Observer, mon
         return response
 
     WorkerService(observer.node, PredictError, "predict_error", predict)
-    model = influence_model(calibrated()[1], RADIUS)
-    mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
-    active: Any = SimpleNamespace(
-        calibration=SimpleNamespace(id="one"),
-        planner=SimpleNamespace(hysteresis=None),
-        mirror=mirror,
-        reachable_range=lambda target, tolerance: (-0.02, 0.02),
-    )
+    active = without_hysteresis("one")
     client = ForecastClient(observer.node)
 
     def refused() -> bool:

@@ -189,8 +189,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
         # Nothing was known of the instrument before it was kept.
-        attributes = {"system_error_subtracted": -1, "reference_surface": "", **attributes}
-        attributes = {"instrument_error": 0.0, "scale_error": 0.0, **attributes}
+        untold: dict[str, Attribute] = {"system_error_subtracted": -1, "reference_surface": ""}
+        attributes = untold | {"instrument_error": 0.0, "scale_error": 0.0} | dict(attributes)
         result: dict[str, Any] = {"points": points}
         for figure in fields(InfluenceFit):
             if figure.name == "points":

@@ -92,14 +92,14 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
             continue
         matrix = _equations(tests, flats, m)
         inverse = np.linalg.pinv(matrix, rcond=DETERMINED)
-        determined = np.isclose(np.diag(inverse @ matrix), 1.0)[: 2 if m else 1]
+        resolved = inverse @ matrix  # a projection, whose trace is the rank
+        determined = np.isclose(np.diag(resolved), 1.0)[: 2 if m else 1]
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
         squares += apart
         if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
             judged += apart
-            sizes = np.linalg.svd(matrix, compute_uv=False)
-            freedom += (2 if m else 1) * len(tests) - int((sizes > DETERMINED * sizes[0]).sum())
+            freedom += (2 if m else 1) * len(tests) - round(np.trace(resolved))
         worst = max(worst, *np.linalg.norm(inverse[: len(determined)], axis=1)[determined], 0.0)
         if not determined.all():
             open_orders.add(m)
