@@ -284,7 +284,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         (folder / name).symlink_to(ROOT / name)
     home = folder / "home"
     config = bench_config(folder / "bench", "drawn_preisach", 0.01, 1, 5.0)  # the shipped mirror in fast time
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.05}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
     config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
     home.mkdir()
