@@ -113,7 +113,7 @@ class SimulatedBench:
     def degauss(self) -> None:
         """Demagnetise as the driver does, and end at mid range."""
         rest = self.mirror.rest
-        points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
+        points = degauss_waypoints(len(rest), float(rest[0]), self.limits.half_range, self.config.degauss_steps, rest)
         self._follow(list(self._limiter.path(self._written, points)), known=False)
         self._turns, self._degausses = self._turns + 1, self._degausses + 1
         self._turned_at = self._drive.signals()

@@ -37,7 +37,7 @@ def expected_accuracy(
     """The expected error of the check moves of a run that begins with a degauss just before its first map.
 
     Args:
-        signals: (M, N) commands, one map each.
+        signals: (M, N) commands less those of mid range, one map each.
         time: (M,) s, when the maps will be taken.
         check: (M,) which moves test the law.
         noise: standard deviation of a coefficient of one map, m.

@@ -109,7 +109,7 @@ class CandidateProblem:
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
-        self._plays = run.along(lambda signals: play_features(signals, self.radius, candidate.powers))
+        self._plays = run.along(lambda signals: play_features(signals, self.radius, candidate.powers, run.rest))
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
         self._scatter = scatter
         self._measured = run.responses.values / scatter
@@ -163,7 +163,7 @@ class CandidateProblem:
         if not self.candidate.slopes:
             return features
         operator = FadingHysteresis(slope)
-        fading = self.run.along(lambda signals: fading_features(signals, operator))
+        fading = self.run.along(lambda signals: fading_features(signals, operator, self.run.rest))
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 

@@ -36,10 +36,10 @@ DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
 
 
-def play_values(signals: Floats, radius: Floats) -> Floats:
-    """(M, R, N) values of play operators of half-widths `radius` (R,) along `signals` (M, N) from a degauss at 0 on."""
+def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
+    """(M, R, N) play operators of half-widths `radius` (R,) along `signals` (M, N) from a degauss at `rest` on."""
     half_width = radius[:, None]
-    play = np.zeros((len(radius), signals.shape[1]))
+    play = np.full((len(radius), signals.shape[1]), rest)
     values = np.empty((len(signals), *play.shape))
     for row, shape in enumerate(signals):
         play = np.clip(play, shape - half_width, shape + half_width)
@@ -47,19 +47,20 @@ def play_values(signals: Floats, radius: Floats) -> Floats:
     return values
 
 
-def play_features(signals: Floats, radius: Floats, powers: int) -> Floats:
-    """Powers of the values of play operators along a sequence that begins demagnetised.
+def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.0) -> Floats:
+    """Powers of the values of play operators along a sequence that begins demagnetised, beyond those at rest.
 
     Args:
         signals: (M, N).
         radius: (R,) half-widths.
         powers: D.
+        rest: signal at which they begin.
 
     Returns:
         (M, R D, N), the powers of one half-width beside each other.
     """
-    values = play_values(signals, radius)
-    stacked = np.stack([values**power for power in range(1, powers + 1)], axis=2)
+    values = play_values(signals, radius, rest)
+    stacked = np.stack([values**power - rest**power for power in range(1, powers + 1)], axis=2)
     return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
 
 
@@ -75,9 +76,9 @@ def pattern_basis(radius: Floats, orders: int) -> Floats:
     return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
 
 
-def fading_features(signals: Floats, operators: FadingHysteresis) -> Floats:
-    """(M, Z, N) values of Duhem operators along `signals` (M, N), which begin at 0 demagnetised."""
-    last = np.zeros(signals.shape[1])
+def fading_features(signals: Floats, operators: FadingHysteresis, rest: float = 0.0) -> Floats:
+    """(M, Z, N) values of Duhem operators along `signals` (M, N), which begin at `rest` demagnetised."""
+    last = np.full(signals.shape[1], rest)
     states = np.zeros((len(last), operators.size))
     values = np.empty((len(signals), operators.size, len(last)))
     for row, shape in enumerate(signals):
@@ -92,18 +93,18 @@ def padded_slope(slope: Floats, actuators: int) -> Floats:
     return np.tile(padded, (actuators, 2, 1))
 
 
-def fading_changes(signals: Floats, slope: Floats) -> Floats:
+def fading_changes(signals: Floats, slope: Floats, rest: float = 0.0) -> Floats:
     """(M, 2 A, N) derivatives of :func:`fading_features` by the coefficients `slope` (N, 2, A) of its operator.
 
     0 for those whose change leads to no operator.
     """
-    still = fading_features(signals, FadingHysteresis(slope))
+    still = fading_features(signals, FadingHysteresis(slope), rest)
     changes = []
     for index in np.ndindex(*slope.shape[1:]):
         changed = slope.copy()
         changed[:, *index] += SLOPE_STEP
         try:
-            changes.append((fading_features(signals, FadingHysteresis(changed)) - still) / SLOPE_STEP)
+            changes.append((fading_features(signals, FadingHysteresis(changed), rest) - still) / SLOPE_STEP)
         except ValueError:
             changes.append(np.zeros_like(still))
     return np.concatenate(changes, axis=1)

@@ -69,7 +69,7 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         law=law,
         zernike_sigma=sigma,
         held_out_max_zernike=largest_of(covariance),
-        unknown_sigma=unknown_history_sigma(found.fit.law),
+        unknown_sigma=unknown_history_sigma(found.fit.law, float(run.signals.min()), float(run.signals.max())),
         maps=int(run.responses.usable.sum()),
         remarks=(*_remarks(found), *_left_out(maps, run)),
     )
@@ -124,7 +124,8 @@ def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, Hys
     crept = _crept_before(run.responses, effective, fading)
     began = 1e-9 * int(maps.stamp_ns[0]) + run.parts[-1][1]
     effective = effective + np.einsum("msn,sn->mn", fading, crept)
-    return replace(maps, applied=effective), replace(law, crept_at=began, crept=crept[-1])
+    rest = law.demagnetised(maps.actuators, began, run.rest).position
+    return replace(maps, applied=effective), replace(law, crept_at=began, crept=rest + crept[-1])
 
 
 def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
@@ -159,13 +160,13 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     return weights_of(unknown, left, gains, np.eye(fading.shape[1]), (1.0, 0.0))
 
 
-def unknown_history_sigma(law: HysteresisModel) -> float:
-    """Standard deviation of the static effective signal at one signal over random histories."""
+def unknown_history_sigma(law: HysteresisModel, low: float, high: float) -> float:
+    """Standard deviation of the static effective signal at one signal over random histories from `low` to `high`."""
     rng = np.random.default_rng(0)
     still = replace(law, creep_rate=0.0)
     differences = []
-    for one, other in zip(*(random_histories(still, -1.0, 1.0, rng, 500) for _ in range(2)), strict=True):
-        signals = rng.uniform(-1.0, 1.0, len(one.signals))
+    for one, other in zip(*(random_histories(still, low, high, rng, 500) for _ in range(2)), strict=True):
+        signals = rng.uniform(low, high, len(one.signals))
         differences.append(still.position_at(one, signals) - still.position_at(other, signals))
     return float(np.std(differences) / np.sqrt(2.0))
 

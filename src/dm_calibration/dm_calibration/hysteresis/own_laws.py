@@ -100,10 +100,10 @@ class OwnLaws:
         self.candidate = candidate
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
-        signals = run.signals
-        values = run.along(lambda signals: play_values(signals, self.radius))
+        signals = run.signals - run.rest
+        values = run.along(lambda signals: play_values(signals, self.radius, run.rest))
         orders = candidate.powers
-        series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
+        series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.full(1, run.rest), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
         if candidate.slopes:
@@ -161,11 +161,11 @@ class OwnLaws:
 
     def _changes(self, slope: Floats) -> Floats:
         """(M, 2 A, N) derivatives of the Duhem operators with `slope` (N, 2, A) by its coefficients."""
-        return self.run.along(lambda signals: fading_changes(signals, slope))
+        return self.run.along(lambda signals: fading_changes(signals, slope, self.run.rest))
 
     def _fading(self, operators: FadingHysteresis) -> Floats:
         """(M, Z, N) values of Duhem operators along the run."""
-        return self.run.along(lambda signals: fading_features(signals, operators))
+        return self.run.along(lambda signals: fading_features(signals, operators, self.run.rest))
 
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats

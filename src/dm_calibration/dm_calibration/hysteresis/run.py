@@ -35,6 +35,7 @@ class Run:
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
         degaussed: (M,) before which maps, at mid range, the mirror was degaussed in its course; None = none.
+        rest: signal of mid range, where a degauss ends.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -47,6 +48,7 @@ class Run:
     moved: Floats | None = None
     segment: NDArray[np.int64] | None = None
     degaussed: NDArray[np.bool_] | None = None
+    rest: float = 0.0
 
     def __post_init__(self) -> None:
         if (np.diff(self.time) < 0.0).any():
@@ -79,9 +81,10 @@ class Run:
         """(M, N) effective signals."""
         followed = []
         for part, start in self.parts:
-            state = law.demagnetised(self.signals.shape[1], start)
+            state = law.demagnetised(self.signals.shape[1], start, self.rest)
             for rows in self._sequences(part):
-                state = law.degaussed(state, state.time if self.moved is None else float(self.moved[rows.start]))
+                time = state.time if self.moved is None else float(self.moved[rows.start])
+                state = law.degaussed(state, time, self.rest)
                 effective, state = follow(law, state, self.signals[rows], self.time[rows], self._moved(rows))
                 followed.append(effective)
         return np.concatenate(followed)
@@ -141,9 +144,8 @@ def run_of(maps: MapSet) -> Run:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    return Run(
-        maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment, maps.degaussed
-    )
+    moved, start = maps.moved_s(), -BEFORE_FIRST_MAP_S
+    return Run(maps.applied, time, responses_of(maps), start, moved, maps.segment, maps.degaussed, maps.rest)
 
 
 def basis_of(columns: Floats) -> Floats:

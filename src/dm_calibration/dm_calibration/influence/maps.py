@@ -103,6 +103,11 @@ class MapSet:
         again = np.concatenate(([False], np.diff(self.step) == 0))
         return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
+    @property
+    def rest(self) -> float:
+        """Signal of mid range, where reference frames are taken and a degauss ends, to the step of the electronics."""
+        return round(float(self.applied[self.reference].mean()), 4) if self.reference.any() else 0.0
+
     def moved_s(self) -> Floats:
         """(M,) s since the first map: when the mirror took each shape; right after the map before, or the degauss
         before the first, where not known, and after a degauss, while which creep follows the middle of its swings.

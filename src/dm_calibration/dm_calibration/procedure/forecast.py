@@ -100,7 +100,7 @@ def forecast(
     parts = [*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(steps)]
     expected = Forecast(duration, 0.0)
     for part in parts:
-        found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
+        found = expected_accuracy(np.array(signals[:part]) - mirror.rest, time[:part], check[:part], noise, influence)
         expected = Forecast(float(time[part - 1]), max(found, float(law / np.sqrt(part))), part)
         if expected.max_zernike <= until:
             break

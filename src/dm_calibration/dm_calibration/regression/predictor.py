@@ -56,9 +56,10 @@ class ErrorPredictor:
         applied = np.concatenate((self.histories, np.broadcast_to(signals, (1, count, actuators))))
         # Histories side by side, as if each had a mirror of its own.
         model = self.sag.hysteresis
-        rested = model.demagnetised(count * actuators, 0.0)
+        rested = model.demagnetised(count * actuators, 0.0, float(self.histories[0, 0, 0]))
         effective, _ = follow(model, rested, applied.reshape(commands + 1, -1), DWELL * np.arange(commands + 1))
-        sag = self.sag.figure[-1] + effective[-1].reshape(count, actuators) @ self.sag.influence
+        moved = effective[-1] - model.effective(rested)
+        sag = self.sag.figure[-1] + moved.reshape(count, actuators) @ self.sag.influence
         same = np.broadcast_to(signals, (count, actuators))
         fit = self.influence
         size = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)

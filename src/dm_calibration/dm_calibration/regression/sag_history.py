@@ -37,7 +37,7 @@ class SagModel:
     Attributes:
         hysteresis: of all actuators; its effective signal begins with weight 1 on the signal.
         influence: (N, P) m per unit effective signal.
-        figure: (R, P) m, at the knots of the drift.
+        figure: (R, P) m, at rest, at the knots of the drift.
     """
 
     hysteresis: HysteresisModel
@@ -62,10 +62,9 @@ class RunHistory:
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
         responses = Responses(self._sag, 0, self._usable)
-        run = Run(
-            maps.applied, time, responses, float(moved[0]) - BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed
-        )
-        self._plays = run.along(lambda signals: play_features(signals, self._radius, 1))
+        start = float(moved[0]) - BEFORE_FIRST_MAP_S
+        run = Run(maps.applied, time, responses, start, moved, maps.segment, maps.degaussed, maps.rest)
+        self._plays = run.along(lambda signals: play_features(signals, self._radius, 1, maps.rest))
         self._crept = run.crept(self._plays)
 
     def fit(self, keep: NDArray[np.bool_]) -> SagModel:
