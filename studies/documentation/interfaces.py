@@ -39,7 +39,8 @@ best effort, which shows nothing before the next message.
 Every field of a request or goal is checked before anything is done: NaN and infinity are answered with NOT_FINITE,
 numbers out of range with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters with
 INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME; the sentence names field, value and what is allowed.
-Figures of a refused request are NaN, and so are those that a run did not come to.
+Figures that were not worked out are NaN: those of a request refused before it was planned, or that a run did not come
+to. One refused for what was found out, a shape out of reach for example, tells what that was.
 
 A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
 `move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`

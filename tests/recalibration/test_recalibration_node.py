@@ -17,11 +17,14 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.msg import Capabilities
-from dm_msgs.srv import HoldMirror, LoadCalibration, UpdateCalibration
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
+from dm_msgs.srv import HoldMirror, LoadCalibration, StoreRecipes, UpdateCalibration
 
 from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
+from dm_common.messages import recipe_book_message
+from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_tools.running_suite import promise_of
 from linear_mirror import LinearMirror
@@ -262,11 +265,19 @@ def test_a_dry_run_goes_on_while_somebody_else_holds_the_mirror(suite: Suite) ->
 def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
     quality = suite.calibration.quality
     before = np.array(suite.calibration.influence_sag)
+    books = suite.observer.record(RecipeBookMsg, "recipes", qos.LATCHED)
+    values = np.linspace(-0.5, 0.5, suite.bench.mirror.actuators)
+    book = RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10, 7)
+    message = recipe_book_message(book, suite.calibration.id)
+    stored = suite.observer.call(StoreRecipes, "store_recipes", StoreRecipes.Request(recipes=message))
+    assert stored.error_code == ErrorCode.OK, stored.message
+    wait_until(lambda: books and books[-1].recipes, 60)
     for bad in (1, 2, 3):
         suite.shape()
         suite.bench.publish_map(suite.bench.map(bump=100e-9))
         told = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
         wait_until(told, 60)
+        wait_until(lambda: not books[-1].recipes, 60, "recipes of the mirror as it was to be withdrawn")
     assert quality == Capabilities.CALIBRATED
     wait_until(lambda: suite.calibration.quality == Capabilities.APPROXIMATE, 60)
     assert suite.calibration.known_limitations[-1].startswith("The last 3 maps disagree with this calibration")

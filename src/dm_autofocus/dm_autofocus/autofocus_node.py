@@ -43,7 +43,7 @@ class AutofocusNode(ManagedNode):
             action(self, self._probe, self._values, lambda: self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance, SET_FOCUS_DISTANCE)
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
-        self.create_service(GetFocusRange, "get_focus_range", answer)
+        self.create_service(GetFocusRange, "get_focus_range", answer, qos_profile=qos.SERVICE)
         self._watched: Any = None
         self._image_problem = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)

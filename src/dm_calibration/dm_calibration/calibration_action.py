@@ -108,6 +108,7 @@ class CalibrateAction:
             until=goal.until,
         )
         self._plan = make_plan(PlanKind(goal.plan or PlanKind.FULL), self._mirror, self._options)
+        self._end = 0 if goal.until else len(self._plan.steps)
 
     def _forecast(self) -> None:
         """Fill in what is to be expected; the message of a dry run."""

@@ -131,8 +131,8 @@ class CalibrationNode(ManagedNode):
         message.aperture_tolerance = float(self._values["aperture_tolerance"])
         self._listener.begin(calibration)
         self._listener.amend(message)
-        # Recipes are of a mirror with all its actuators. First, so that nobody takes the calibration for one without.
-        book = calibration.recipes if calibration and not self._listener.given_up else NO_RECIPES
+        # First, so that nobody takes the calibration for one without.
+        book = calibration.recipes if calibration and not self._listener.recipes_in_doubt else NO_RECIPES
         self._recipes.publish(recipe_book_message(book, message.id))
         self._publisher.publish(message)
 

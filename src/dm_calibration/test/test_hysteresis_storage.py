@@ -31,7 +31,8 @@ def recipe(curvature: float) -> Recipe:
 
 
 ASTIGMATISM = replace(recipe(0.0), zernike=(*5 * (0.0,), 2e-7, *15 * (0.0,)))
-BOOK = RecipeBook((recipe(-0.01), recipe(0.02), ASTIGMATISM), 100, 3e-10, 1_700_000_000_000_000_000)
+FOLLOWED = replace(recipe(0.02), by_model=np.array([0.5, 0.6]))
+BOOK = RecipeBook((recipe(-0.01), FOLLOWED, ASTIGMATISM), 100, 3e-10, 1_700_000_000_000_000_000)
 
 
 def test_a_hysteresis_comes_back() -> None:
@@ -53,8 +54,9 @@ def test_recipes_come_back() -> None:
     for one, other in zip(back.recipes, BOOK.recipes, strict=True):
         assert (one.shape, one.max_zernike, one.maps) == (other.shape, other.max_zernike, other.maps)
         np.testing.assert_array_equal(one.effective, other.effective)
+        np.testing.assert_array_equal(one.by_model, other.by_model)
     before = recipe_columns(RecipeBook(BOOK.recipes[:2], 100, 0.0, 1))
-    del before["recipes/zernike"]  # as files were before recipes had added terms
+    del before["recipes/zernike"], before["recipes/by_model"]  # as files were before recipes had these
     assert [one.shape for one in recipes_from(before).recipes] == [one.shape for one in BOOK.recipes[:2]]
 
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from dm_msgs.msg import ZernikeCoefficients
+from std_msgs.msg import Header
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
-from dm_calibration.acquisition.interferometer_messages import sensor_map
+from dm_calibration.acquisition.interferometer_messages import sensor_map, zernike_message
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.errors import ErrorCode, Refusal
@@ -48,6 +49,7 @@ def test_coefficients_in_any_convention_become_a_measurement(convention: str, se
     np.testing.assert_allclose(found.sag, basis(found.points.x, found.points.y) @ WANTED, atol=1e-14)
     assert (found.radius, found.residual_rms, found.instrument) == (pytest.approx(RADIUS), 4e-9, "topic /wavefront")
     assert found.valid_fraction > 0.99 and surface.file == found.file == ""
+    assert not zernike_message(found, Header()).sigma, "what a sensor's terms are right to is not known"
 
 
 def test_a_smaller_aperture_of_the_mirror_is_cut_out() -> None:

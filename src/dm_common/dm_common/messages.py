@@ -241,7 +241,7 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
 
 #: Fields of Recipe that a dm_msgs/Recipe has under the same names.
 _ARRAYS, _NUMBERS = (
-    ("effective", "signals", "zernike"),
+    ("effective", "signals", "zernike", "by_model"),
     ("curvature", "conic_constant", "max_zernike", "rms", "maps"),
 )
 
@@ -272,6 +272,7 @@ def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
             effective=np.array(recipe.effective, dtype=np.float64),
             signals=np.array(recipe.signals, dtype=np.float64),
             zernike=tuple(recipe.zernike),
+            by_model=np.array(recipe.by_model, dtype=np.float64),
             **taken(recipe, *_NUMBERS),
         )
         for recipe in message.recipes

@@ -8,7 +8,7 @@ later time and creep. On a mirror without an identified model they are the signa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,8 @@ class Recipe:
         max_zernike, rms: m, re-measured: largest coefficient error beyond tilt, sag error.
         maps: taken to find it.
         zernike: m, added sag, as requested; () = none.
+        by_model: (N,) effective signals that the calibration gave for it then: what it has learnt since about the
+            mirror moves the recipe too; empty = not known.
     """
 
     curvature: float
@@ -43,6 +45,7 @@ class Recipe:
     rms: float
     maps: int
     zernike: tuple[float, ...] = ()
+    by_model: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
     def series(self) -> tuple[float, tuple[float, ...]]:
@@ -79,15 +82,16 @@ class RecipeBook:
         if len({len(recipe.effective) for recipe in self.recipes}) > 1:
             raise RecipeError("recipes: are of mirrors with different numbers of actuators")
         for recipe in self.recipes:
-            if recipe.signals.shape != recipe.effective.shape or not np.isfinite(recipe.effective).all():
+            count, known = len(recipe.effective), np.concatenate((recipe.effective, recipe.by_model))
+            if len(recipe.signals) != count or len(known) not in (count, 2 * count) or not np.isfinite(known).all():
                 raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
 
     def check_condition(self, degauss_steps: int) -> None:
         """Raise RecipeError when recipes that begin with so many half-swings cannot join these."""
         if self.recipes and degauss_steps != self.degauss_steps:
             raise RecipeError(
-                f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}; "
-                "build all of them again"
+                f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}: "
+                "must be the same (recipes.degauss_steps), or calibrate anew"
             )
 
     def merged(self, newer: RecipeBook) -> RecipeBook:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,7 @@ ASTIGMATISM = tuple(2e-7 * (name == "astigmatism cos") for name in SPOKEN)
 
 def recipe(curvature: float, actuators: int = 2, zernike: tuple[float, ...] = ()) -> Recipe:
     signals = np.full(actuators, curvature)
-    return Recipe(curvature, 0.0, signals, signals + 0.1, 1e-10, 2e-10, 5, zernike)
+    return Recipe(curvature, 0.0, signals, signals + 0.1, 1e-10, 2e-10, 5, zernike, signals + 0.2)
 
 
 def test_recipes_go_there_and_back() -> None:
@@ -125,11 +126,14 @@ def test_recipes_go_there_and_back() -> None:
     for one, other in zip(book.recipes, back.recipes, strict=True):
         figures = [(each.shape, each.max_zernike, each.rms, each.maps) for each in (one, other)]
         assert figures[0] == figures[1]
-        assert (one.effective == other.effective).all() and (one.signals == other.signals).all()
+        for name in ("effective", "signals", "by_model"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_recipes_that_do_not_fit_together_are_refused() -> None:
     with pytest.raises(RecipeError, match="must rise"):
         RecipeBook((recipe(0.02), recipe(-0.01)), 100, 0.0, 0)
+    with pytest.raises(RecipeError, match="effective signals must be finite, one each"):
+        RecipeBook((replace(recipe(-0.01), by_model=np.zeros(3)),), 100, 0.0, 0)
     with pytest.raises(RecipeError, match="different numbers of actuators"):
         RecipeBook((recipe(-0.01), recipe(0.02, actuators=3)), 100, 0.0, 0)

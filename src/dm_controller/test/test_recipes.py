@@ -111,6 +111,18 @@ def test_between_recipes_what_the_neighbours_show_corrects_the_model() -> None:
         assert error < found.error
 
 
+def test_what_the_calibration_has_learnt_since_moves_recipes_too() -> None:
+    """By as much as any shape, and not as if the recipes had shown an error of the model."""
+    made = [replace(recipe(c, scaled(np.ones(ACTUATORS), 20e-9)), by_model=own(FocusTarget(c))) for c in CURVATURES]
+    learnt: Any = StandIn(1e-9)
+    moved = 0.01 * np.random.default_rng(5).standard_normal(ACTUATORS)
+    learnt.mirror.command = lambda target: (own(target) + moved, 0.0)
+    for curvature in (0.02, 0.025):
+        then, now = (Corrections(book(*made), one).find(FocusTarget(curvature)) for one in (PLANNER, learnt))
+        np.testing.assert_allclose(now.effective, then.effective + moved, atol=1e-12)
+        assert then.error <= now.error < then.error + 1e-9
+
+
 def test_the_worse_neighbour_counts() -> None:
     two = book(recipe(0.0, measured=1e-10), recipe(0.02, measured=4e-10))
     found = Corrections(two, PLANNER).find(FocusTarget(0.01))

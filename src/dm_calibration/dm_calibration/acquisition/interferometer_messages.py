@@ -51,7 +51,7 @@ def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficient
         header=header,
         convention=BORN_WOLF,
         coefficients=doubles(measured.coefficients),
-        sigma=doubles(measured.sigma),
+        sigma=doubles(measured.sigma[np.isfinite(measured.sigma)]),
         **taken(measured, *OF_FIT),
     )
 

@@ -43,7 +43,8 @@ def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[S
         settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
     surface, measured = ingest.measure(surface, settings)
     sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exactly, also between pixels
-    return surface, replace(measured, residual_rms=residual_rms, sag=sag)
+    unknown = np.full_like(measured.coefficients, np.nan)
+    return surface, replace(measured, residual_rms=residual_rms, sag=sag, sigma=unknown)
 
 
 class SensorAcquisition:

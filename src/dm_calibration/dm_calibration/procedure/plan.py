@@ -95,7 +95,10 @@ class PlanOptions:
     """
 
     poke_amplitude: float = live_parameter(real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised.")
-    reference_every: int = live_parameter(whole(10, 1, 1000), "Steps between two reference frames.")
+    reference_every: int = live_parameter(
+        whole(10, 1, 1000),
+        "Steps between two reference frames of pokes and surfaces; a hysteresis run has one every 100.",
+    )
     surfaces: Sequence[str] = ()
     degauss: bool = True
     hysteresis_maps: int = live_parameter(

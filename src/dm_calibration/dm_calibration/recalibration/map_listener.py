@@ -37,8 +37,7 @@ REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
 #: Maps of which messages are still to come, and maps remembered so that none counts twice.
-INCOMPLETE_KEPT = 8
-MAPS_KEPT = 64
+INCOMPLETE_KEPT, MAPS_KEPT = 8, 64
 
 
 def _becomes(condition: Callable[[], bool], patience: float) -> bool:
@@ -67,9 +66,10 @@ class MapListener:
         self._node, self._values = node, values
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
-        self.history = AppliedHistory()
+        self.history = AppliedHistory()  # what stood at the mirror, which the node forgets with it
         self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
+        self._exchange = threading.Lock()  # a map is compared by the law that its effective signals are of
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
         self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
@@ -94,31 +94,30 @@ class MapListener:
         kept = self._updates.in_use
         if calibration is (kept and kept.calibration):
             return
-        self._updates.folder = self._manager.store.folder
-        try:
-            remark = self._updates.begin(calibration)
-        except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
-            remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
+        middle = float(mirror.rest[0]) if (mirror := self._manager.mirror) is not None else 0.0
+        law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
+        with self._exchange:
+            self._updates.folder = self._manager.store.folder
+            try:
+                remark = self._updates.begin(calibration)
+            except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
+                remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
+            if law is not self._law:  # recipes may have been added to the same calibration
+                self._law = law
+                self.history.follow(law, middle)
         if remark:
             self._node.get_logger().warning(remark)
-        mirror = self._manager.mirror
-        middle = float(mirror.rest[0]) if mirror is not None else 0.0
-        law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
-        if law is not self._law:  # recipes may have been added to the same calibration
-            self._law = law
-            self.history.follow(law, middle)
 
     def amend(self, message: CalibrationMsg) -> None:
         """Put what maps have shown since into the message of the calibration in use."""
-        temperature = self._temperatures.published()
         if (kept := self._updates.in_use) is not None:
             self._published_at, self._dirty = time.monotonic(), False
-            put_updates(message, kept, temperature, self._doubts(), self._updates.mirror_changed)
+            put_updates(message, kept, self._temperatures.published(), self._doubts(), self._updates.mirror_changed)
 
     @property
-    def given_up(self) -> bool:
-        """Whether the calibration in use goes on without some actuators."""
-        return (kept := self._updates.in_use) is not None and bool(kept.drift.given_up)
+    def recipes_in_doubt(self) -> bool:
+        """Whether the mirror goes on without some actuators, or maps disagree: recipes are of what it was."""
+        return (kept := self._updates.in_use) is not None and bool(kept.drift.given_up or kept.disagreement)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
@@ -207,7 +206,8 @@ class MapListener:
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
-        verdict = self._updates.take(measured, self.history.settled(at, still), dry_run, without)
+        with self._exchange:
+            verdict = self._updates.take(measured, self.history.settled(at, still), dry_run, without)
         if not dry_run:
             self._taken += verdict.accepted
             if not verdict.accepted:

@@ -12,8 +12,8 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
-#: Of each recipe; its added terms are kept as a table.
-_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name != "zernike")
+#: Of each recipe, always; its added terms are kept as a table.
+_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model"))
 
 
 def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
@@ -62,6 +62,8 @@ def recipe_columns(book: RecipeBook) -> dict[str, Column]:
         f"recipes/{name}": np.array([getattr(recipe, name) for recipe in book.recipes]) for name in _RECIPE_COLUMNS
     }
     columns["recipes/zernike"] = np.array([recipe.zernike or len(TERMS) * (0.0,) for recipe in book.recipes])
+    known = [recipe.by_model if recipe.by_model.size else np.nan * recipe.effective for recipe in book.recipes]
+    columns["recipes/by_model"] = np.array(known)
     columns["recipes/degauss_steps"] = np.array(book.degauss_steps)
     columns["recipes/interpolation_error"] = np.array(book.interpolation_error)
     columns["recipes/stamp_ns"] = np.array(book.stamp_ns)
@@ -78,9 +80,14 @@ def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
         return NO_RECIPES
     rows = [np.asarray(columns[f"recipes/{name}"]) for name in _RECIPE_COLUMNS]
     zernike = np.asarray(columns.get("recipes/zernike", np.zeros((len(rows[0]), 0)))).tolist()
+    by_model = np.asarray(columns.get("recipes/by_model", np.full((len(rows[0]), 1), np.nan)))
     recipes = tuple(
-        replace(Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row)), zernike=terms)
-        for row, terms in zip(zip(*rows, strict=True), map(tuple, zernike), strict=True)
+        replace(
+            Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row)),
+            zernike=tuple(terms),
+            by_model=own if np.isfinite(own).all() else np.zeros(0),
+        )
+        for row, terms, own in zip(zip(*rows, strict=True), zernike, by_model, strict=True)
     )
     return RecipeBook(
         recipes,

@@ -163,6 +163,7 @@ class RecipeBuilder:
             rms=rms_sag(error, self._loop.mirror.model),
             maps=maps,
             zernike=taken.target.zernike,
+            by_model=self._loop.mirror.command(taken.target)[0],
         )
 
     def _error(self, taken: _Round) -> Shape:

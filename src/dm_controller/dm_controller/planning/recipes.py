@@ -104,9 +104,13 @@ class Corrections:
             TARGET.check(shape)
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
-        own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
-        self._own = own + self._other_tilt(own)
-        self._corrections = self._effective - self._own
+        now = [planner.mirror.command(shape)[0] for shape in shapes]
+        # A calibration follows the mirror, and what it learns moves recipes as it moves every shape.
+        known = zip(recipes, now, strict=True)
+        then = np.array([recipe.by_model if recipe.by_model.size else own for recipe, own in known])
+        tilt = self._other_tilt(then)
+        self._then, self._own = then + tilt, np.array(now) + tilt
+        self._corrections = self._effective - self._then
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
         missed, left = self._kriging.left_out(self._corrections)
@@ -153,7 +157,7 @@ class Corrections:
         """
         own, apart = self._mirror.command(target)[0], np.abs(self._surfaces - self._surface(target)).max(axis=1)
         if (same := np.flatnonzero(apart <= SAME_SHAPE)).size:
-            changes = own - self._own[same]
+            changes = own - self._then[same]
             least = int(np.abs(changes).max(axis=1).argmin())
             recipe, change = int(same[least]), changes[least]
             measured = float(self._measured[recipe])
