@@ -91,7 +91,8 @@ class JilesAthertonHysteresis:
     """The domain wall law of [36], which [37] carries over to piezo ceramics; tanh is the curve without walls.
 
     Walls are pinned: m follows that curve only on the way towards it, the slower the stronger they are pinned, and
-    bends reversibly by a share of its slope. Minor loops neither close nor wipe anything out.
+    bends reversibly by a share of its slope. Minor loops neither close nor wipe anything out. Simplified: m adds to the
+    signal, but not to its change. The step is that of the actuator that moves farthest, which makes 3 nm at most.
 
     Args:
         width, pinning, reversible, coupling: of that curve, of a full loop, share, and how m adds to the signal; (N,).
