@@ -12,7 +12,7 @@ import pytest
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
-from dm_calibration.map_files import NoValidPixelsError, read_map
+from dm_calibration.map_files import NoValidPixelsError, SurfaceMap, read_map
 from dm_calibration.map_files.fits import fits_bytes
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.optics.orientation import Orientation
@@ -202,6 +202,9 @@ def test_too_few_pixels_and_none(tmp_path: Path) -> None:
     path.write_bytes(dat_bytes(np.full((30, 30), NO_DATA)))
     with pytest.raises(NoValidPixelsError):
         Ingest().read(path, IngestSettings())
+    empty = SurfaceMap(np.full((30, 30), np.nan), WAVELENGTH, None, "array")
+    with pytest.raises(InsufficientDataError, match="no valid pixel"):
+        Ingest().measure(empty, IngestSettings(retrace=(1e-3,) * 36))
 
 
 def test_one_ingest_serves_changing_masks(tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.optics.flats import FlatTest, reference_from_flats
 from dm_calibration.optics.instrument import find_retrace, lateral_scale, undistorted, without_retrace
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
@@ -47,6 +50,20 @@ def test_three_flats_of_which_one_was_turned() -> None:
     tests = [against("A", "B"), against("A", "B", 37.0), against("A", "C"), against("B", "C"), against("B", "C", 90.0)]
     error, bound, left_open = error_of(tests)
     assert (left_open, error < bound < 0.5e-9) == ((), True)
+
+
+@pytest.mark.parametrize("term", [3, 10, 20])
+def test_what_the_maps_say_against_each_other_is_told_as_rms(term: int) -> None:
+    turns = [("A", "B", 0.0), ("A", "B", 37.0), ("A", "C", 0.0), ("B", "C", 0.0), ("B", "C", 90.0)]
+    apart = 20e-9 * basis(X, Y)[..., term]
+    tests = [replace(test, sag=test.sag + sign * apart) for sign in (1, -1) for test in [against(*t) for t in turns]]
+    assert reference_from_flats(tests).left == pytest.approx(np.sqrt(np.mean(apart[DISC] ** 2)), rel=0.03)
+
+
+def test_maps_of_too_few_pixels_are_refused() -> None:
+    tests = [replace(test, sag=test.sag[::6, ::6]) for test in (against("A", "B"), against("A", "B", 37.0))]
+    with pytest.raises(InsufficientDataError, match=r"share \d+ valid pixels: must be 364 or more, for 91 terms"):
+        reference_from_flats(tests)
 
 
 def test_three_flats_without_a_turn_leave_the_odd_part_open() -> None:

@@ -228,6 +228,19 @@ def test_maps_that_show_something_else() -> None:
     assert any("do not fit the configured positions" in finding for finding in findings), findings
 
 
+@pytest.mark.parametrize("driven", [[0], [5], [20], [0, 1], [5, 20]])
+def test_all_channels_on_the_same_place(driven: list[int]) -> None:
+    result = check(response()[:, np.resize(driven, 37)])
+    assert "all channels move the same one or two places: check the wiring" in result.findings[0]
+    assert result.registration is None
+
+
+def test_every_channel_moves_a_second_place() -> None:
+    moved, measured = [5, 20, 31], response()
+    measured[:, moved] += PLANT.influence[:, [8, 25, 27]]
+    assert "together" in " ".join(check(measured, unmoved=~np.isin(np.arange(37), moved)).findings)
+
+
 def test_inverted_signs() -> None:
     assert "all actuators move the surface the opposite way" in check(-response()).findings[0]
     one = response()
@@ -245,6 +258,11 @@ def test_dead_actuators_do_not_confuse_the_others() -> None:
     measured[:, silent] = NOISE * np.random.default_rng(1).standard_normal((measured.shape[0], 2))
     assert check(measured, silent=silent).findings == ("actuators 6, 26 show no response above the noise",)
     assert check(measured, silent=np.zeros(37, dtype=bool), unmoved=silent).passed
+
+
+@pytest.mark.parametrize("moved", [[0, 1, 2], [13, 14, 33], [8, 11, 13, 20]])
+def test_a_few_actuators_moved_do_not_stand_otherwise(moved: list[int]) -> None:
+    assert check(response(), unmoved=~np.isin(np.arange(37), moved)).findings == ()
 
 
 def test_dead_actuator_and_exchanged_pair() -> None:

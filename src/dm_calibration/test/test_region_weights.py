@@ -170,6 +170,7 @@ def test_surface_control_error_is_the_map_less_its_nominal_surface() -> None:
 
 def test_cross_validation_finds_weights_where_they_help() -> None:
     found = weighting(rim_maps())
+    assert found.surfaces == 40 and weighting(replace(rim_maps(), step=np.arange(42) // 2)).surfaces == 21
     assert found.variance.argmax() == found.weights.argmin() == 9
     assert 0 < found.score.argmin() < len(EPSILON_CANDIDATES) - 1
     assert found.helps and found.score.min() < 0.9 * found.score_unweighted
@@ -240,6 +241,8 @@ def test_pokes_stand_in_where_there_are_no_surfaces() -> None:
     assert sample_surfaces(maps).sum() == maps.kind.count("surface") > 4
     pokes = maps.select(np.array([kind != "surface" for kind in maps.kind]))
     assert np.array_equal(sample_surfaces(pokes), ~pokes.reference)
+    one_sided = pokes.select(np.array(["poke-" not in label for label in pokes.label]))
+    assert 0.0 < weighting(one_sided).score_unweighted < np.inf  # of extrapolation, as nothing else is there
 
 
 @pytest.mark.parametrize("piston_tilt", [0.0, 1e-6])

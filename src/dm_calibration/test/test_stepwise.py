@@ -191,6 +191,8 @@ def test_other_bad_input_is_refused_in_words() -> None:
     x, y = candidates(15, count=4), np.arange(50.0)
     with pytest.raises(TooFewMapsError, match=r"11 samples: .* need at least 12"):
         stepwise(x[:11], y[:11], NAMES[:4])
+    with pytest.raises(TooFewMapsError, match="1 samples"):  # which differs from no other
+        stepwise(x[:1], y[1:2], NAMES[:4])
     with pytest.raises(TooFewMapsError, match="11 samples"):
         leave_one_out(x[:12], y[:12])
     with pytest.raises(ValueError, match="the response is the same for all samples"):

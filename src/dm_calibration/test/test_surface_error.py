@@ -12,7 +12,7 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.sag_history import RunHistory
-from dm_calibration.regression.surface_error import surface_errors, surface_weights
+from dm_calibration.regression.surface_error import model_candidates, surface_errors, surface_weights
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
 from hysteretic_mirror import calibrated, calibrated_by_pokes, lagging_bench
@@ -69,6 +69,16 @@ def test_the_law_of_a_known_hysteresis_is_found() -> None:
     rms = np.sqrt(np.square(left) @ maps.points.weight)
     linear = remove_piston_tilt(maps.sag - fit.sag_offset - maps.applied @ fit.influence_sag.T, maps.points)[~keep]
     assert np.median(rms) < 0.4 * np.median(np.sqrt(np.square(linear) @ maps.points.weight))
+
+
+def test_an_actuator_that_never_moved_is_no_candidate() -> None:
+    maps, _ = calibrated()
+    maps = replace(maps, applied=maps.applied * (np.arange(37) != 4))
+    fit = fit_influence(maps)
+    names, candidates = model_candidates(maps, fit, surface_errors(maps, fit), lambda _: maps.sag)
+    assert len(names) == candidates.shape[1] == 37 and "s05" not in names
+    mean, lower, upper = fit_predictor(maps, fit).predict(maps.applied[maps.label.index("p44")])
+    assert 0.0 <= lower <= mean <= upper
 
 
 def test_commands_to_come_lie_in_their_intervals() -> None:

@@ -202,7 +202,7 @@ class _Fitted(NamedTuple):
         response[self.design.excited] = rms(regression.coefficients[self.design.drift :, maps.terms :], weight)
         rest = maps.applied[maps.reference].mean(axis=0) if maps.reference.any() else 0.0
         return screening.worst_outlier(
-            rms(regression.residual[:, maps.terms :], weight),
+            quality.seen_rms(regression.residual[:, maps.terms :], maps.sag, weight),
             regression.leverage,
             maps.applied - rest,
             response,
@@ -234,21 +234,24 @@ def _judge(
     coefficients[design.excited] = regression.coefficients[design.drift :]
     figure = regression.coefficients[: design.drift]
 
-    freedom = len(good) - design.unknowns
     residual = regression.residual
-    variance = np.square(residual).sum(axis=0) / freedom
-    scatter = float(np.sqrt(variance[terms:] @ weight))
+    counted = np.hstack((np.ones((len(good), terms), dtype=bool), np.isfinite(good.sag)))
+    freedom = np.maximum(counted.sum(axis=0) - design.unknowns, 1)
+    variance = (np.square(residual) * counted).sum(axis=0) / freedom
+    scatter = float(np.sqrt(variance[terms:] @ weight / (weight @ counted[:, terms:].any(axis=0))))
     covariance = np.zeros((maps.actuators, maps.actuators))
     covariance[np.ix_(design.excited, design.excited)] = regression.covariance[design.drift :, design.drift :]
     standard_error = scatter * np.sqrt(np.diag(covariance))
 
-    held_out, tested = quality.held_out_residual(design, responses, good.step, ~good.reference, options.folds)
-    untested = int((~tested & ~good.reference).sum())
-    in_sample = rms(residual[:, terms:], weight)
+    held = ~good.reference
+    held_out, tested = quality.held_out_residual(design, responses, good.step, held, options.folds)
+    judged = tested if tested.any() else held
+    left = quality.seen_rms(held_out[:, terms:], good.sag, weight)[judged]
+    in_sample = quality.seen_rms(residual[:, terms:], good.sag, weight)
     map_residual = np.full(len(maps), np.nan)
     map_residual[used] = in_sample
-    error = float(np.percentile(np.abs(held_out[tested, PISTON_TILT:terms]).max(axis=1, initial=0.0), 95.0))
-    if limits is not None:
+    error = float(np.percentile(np.abs(held_out[judged, PISTON_TILT:terms]).max(axis=1, initial=0.0), 95.0))
+    if limits is not None and tested.any():
         moved = (good.applied - limits.middle) @ coefficients[:, terms:]
         share = quality.loop_share(held_out[:, terms:], moved, weight, tested, options.hysteresis_allowance)
         error, more = quality.with_loops(error, share, coefficients[:, :terms].T, limits)
@@ -281,7 +284,7 @@ def _judge(
         reasons=tuple(reasons),
         map_residual=map_residual,
         in_sample_rms=float(np.sqrt(np.mean(np.square(in_sample)))),
-        held_out_rms=float(np.sqrt(np.mean(np.square(rms(held_out[tested, terms:], weight))))),
+        held_out_rms=float(np.sqrt(np.mean(np.square(left)))),
         held_out_max_zernike=error,
         condition_number=quality.condition_number(coefficients[:, :terms].T, tilt_known),
         response=response,
@@ -290,7 +293,7 @@ def _judge(
         grades=grades,
         drift_rms=float(np.sqrt(np.mean(np.square(rms(figure_sag - figure_sag.mean(axis=0), weight))))),
         limitations=(
-            *quality.limitations(good, design, grades, tilt_known, untested),
+            *quality.limitations(good, design, grades, tilt_known, tested),
             *quality.blur(response, standard_error, design.excited, options.weak_sigmas),
             *remarks,
         ),

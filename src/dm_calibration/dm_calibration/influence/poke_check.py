@@ -117,15 +117,21 @@ def check_pokes(
         return replace(nothing, findings=(problem, *findings))
     single, double = active, {}
     for _ in range(2):  # again without those that move two places, which would bend it
-        registration = register(unit[single], single, points, x, y, radius)
+        stands = register(unit[single], single, points, x, y, radius)
+        if stands is None:
+            problem = (
+                "all channels move the same one or two places: check the wiring, and that the maps are of this mirror"
+            )
+            return replace(nothing, findings=(*findings, problem))
+        registration = stands
         expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
         height = np.maximum(height, np.finfo(float).tiny)
         table = np.zeros((count, count))
         table[active] = (unit[active] * points.weight) @ expected.T
         double = _doubled(table, (expected * points.weight) @ expected.T, height)
-        if not double:
-            break
         single = np.setdiff1d(active, list(double))
+        if not double or single.size < ANSWERS_MIN:
+            break
     place = _places(np.abs(table), active, double)
     found = table[np.arange(count), place]
     if np.median(np.abs(found[active])) < FIT_MIN:

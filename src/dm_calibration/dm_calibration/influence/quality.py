@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import EXCITATION, MapSet
-from dm_calibration.influence.regression import Design
+from dm_calibration.influence.regression import Design, seen_alike
 from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
@@ -108,8 +108,7 @@ def held_out_residual(
 
     Returns:
         The residual (M, Q), and which maps (M,) were tested. A map whose prediction is EXTRAPOLATION_MAX times as
-        uncertain as a measurement is not, because the fit without its fold knows too little about what it moves;
-        unless no map could be tested otherwise.
+        uncertain as a measurement is not, because the fit without its fold knows too little about what it moves.
     """
     fold = folds_of(step, held, folds)
     residual = np.full(responses.shape, np.nan)
@@ -123,8 +122,7 @@ def held_out_residual(
         known = inverse @ design.matrix[~left_out]
         beyond = np.abs(design.matrix[left_out] - design.matrix[left_out] @ known).max(axis=1, initial=0.0) > 1e-6
         inflation[left_out] = np.where(beyond, np.inf, inflation[left_out])
-    tested = inflation <= EXTRAPOLATION_MAX
-    return residual, tested if tested.any() else fold >= 0
+    return residual, inflation <= EXTRAPOLATION_MAX
 
 
 def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.bool_], allowance: float) -> float:
@@ -163,6 +161,15 @@ def with_loops(error: float, share: float, influence_zernike: Floats, limits: Li
     ]
 
 
+def seen_rms(residual: Floats, sag: Floats, weight: Floats) -> Floats:
+    """(M,) m, rms of the residuals (M, P) over the points at which each map (M, P) has data.
+
+    Points that the fit has filled follow it, and tell nothing of its error.
+    """
+    seen = np.isfinite(sag)
+    return np.asarray(np.sqrt((np.square(residual) * seen) @ weight / (seen @ weight)))
+
+
 def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     """Ratio of the largest to the smallest singular value of G without piston, and without tilt unless it is known.
 
@@ -174,12 +181,14 @@ def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     return float(np.linalg.cond(influence_zernike[first:] * rms))
 
 
-def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, untested: int) -> list[str]:
+def limitations(
+    good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, tested: NDArray[np.bool_]
+) -> list[str]:
     """What a user of an influence function fitted to the maps `good` must know, in sentences.
 
     Args:
         grades: (N,) GRADE_*.
-        untested: number of maps that the cross-validation could not judge.
+        tested: (M,) maps that the cross-validation could judge.
     """
     if EXCITATION in good.kind:
         sentences = ["The influence function acts on effective signals; hysteresis and creep are in their model."]
@@ -191,7 +200,10 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
             "the condition number leaves tilt out."
         )
     if design.drift == 1:
-        sentences.append("The figure is taken as constant over the run: too few reference frames to follow its drift.")
+        sentences.append(
+            "The figure is taken as constant over the run: too few reference frames, or too few maps beside them, to "
+            "follow its drift."
+        )
     for value, text in (
         (GRADE_WEAK, "respond weakly or uncertainly"),
         (GRADE_DEAD, "show no response above the noise"),
@@ -200,12 +212,20 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         numbers = np.flatnonzero(grades == value) + 1
         if numbers.size:
             sentences.append(f"Actuators {', '.join(map(str, numbers))} {text}.")
-    if untested:
+    if not tested.any():
+        sentences.append(
+            "Every map moves an actuator as no other map does: the held-out error is one of extrapolation and tells "
+            "little of the influence function; poke each actuator both ways, or add surfaces."
+        )
+    elif untested := int((~tested & ~good.reference).sum()):
         sentences.append(
             f"{untested} maps move an actuator as no other map does; predicting them from the others would be "
             "extrapolation, so they do not count in the held-out error."
         )
-    blind = np.isnan(good.sag).all(axis=0).sum()
+    blind = sum(len(one.points) for one in seen_alike(design, np.isfinite(good.sag)) if one.inverse is None)
     if blind:
-        sentences.append(f"{blind} of the {good.points.x.size} sampling points have no data in any map.")
+        sentences.append(
+            f"{blind} of the {good.points.x.size} sampling points have no data in any map, or in too few to "
+            "determine the influence function there."
+        )
     return sentences

@@ -119,6 +119,7 @@ def choose_weighting(
 
     # Which held-out predictions are extrapolation does not depend on the responses: any column tells.
     _, tested = quality.held_out_residual(design, sag[:, :1], maps.step, chosen, folds)
+    tested = tested if tested.any() else chosen
     squares = np.zeros(fractions.size)
     modes = basis(maps.points.x, maps.points.y)
     for k in range(int(fold.max()) + 1):
@@ -146,7 +147,7 @@ def choose_weighting(
         candidates=candidates,
         score=score[1:],
         score_unweighted=float(score[0]),
-        surfaces=int(chosen.sum()),
+        surfaces=states,
         folds=int(fold.max()) + 1,
     )
 

@@ -39,6 +39,10 @@ TRIED = 36
 ROUNDS = 20
 #: A bump further than this from every configured place, in pitches, belongs to none.
 TOLERANCE = 0.7
+#: Bumps nearer to each other than this, in pitches, are of one place.
+TOGETHER = 0.5
+#: Fewest places that tell a turn from a mirror image.
+PLACES_MIN = 3
 #: Descriptions whose mean square distances differ by less than this, in square pitches, fit alike.
 ALIKE = 0.02
 #: Among those, this share of the actuators more in place is worth another turn.
@@ -117,8 +121,9 @@ def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
 
 def register(
     unit: Floats, active: NDArray[np.int64], points: SamplePoints, x: Floats, y: Floats, radius: float
-) -> Registration:
+) -> Registration | None:
     """Find how the mirror stands in the maps; where the responses are of something else, it is what fits least badly.
+    None where all lie over one place or two.
 
     Args:
         unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
@@ -130,6 +135,8 @@ def register(
     places: Places = np.asarray((x + 1j * y) / radius, dtype=np.complex128)
     step = pitch(places.real, places.imag)
     seen, width = _located(unit, points, step)
+    if np.unique((np.abs(seen[:, None] - seen) < TOGETHER * step).argmax(axis=1)).size < PLACES_MIN:
+        return None
     match = _matched(seen, active, places, step)
     return _refined(match, unit, points, places, width, radius)
 
@@ -156,7 +163,10 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
     ]
     nearest = [np.abs(_seen(start, places)[:, None] - seen).min(axis=0) / step for start in starts]
     order = np.argsort([np.mean(np.minimum(distance, TOLERANCE) ** 2) for distance in nearest], kind="stable")
-    matches = [_closest(seen, places, starts[index], step) for index in order[:TRIED]]
+    own = _Similarity(
+        1.0 + 0j, complex((seen - places[active]).mean()), False
+    )  # as configured: few bumps fit many turns
+    matches = [_closest(seen, places, start, step) for start in (own, *(starts[index] for index in order[:TRIED]))]
     least = min(match.distance for match in matches)
     alike = [match for match in matches if match.distance < least + ALIKE]
     moved = [int((match.place != active).sum()) for match in alike]

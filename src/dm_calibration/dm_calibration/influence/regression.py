@@ -13,6 +13,7 @@ map.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -34,6 +35,8 @@ EXCITATION_MIN = 0.0199
 DRIFT_SPARE_MAPS = 5
 #: Smallest singular value of the design, relative to the largest, that still tells actuators apart.
 RANK_TOLERANCE = 1e-7
+#: Least share of a direction of the unknowns that the maps which see a point must hold to determine it there.
+SEEN_MIN = 1e-6
 #: Rounds in which sampling points without data are filled from the fit, and the change in m that ends them sooner.
 GAP_ROUNDS = 60
 GAP_TOLERANCE = 1e-11
@@ -81,16 +84,19 @@ class Regression:
     covariance: Floats
 
 
-def drift_columns(stamp_ns: NDArray[np.int64], reference: NDArray[np.bool_]) -> Floats:
-    """(M, R) columns of the design: hat functions of time with a knot at each distinct time of a reference frame.
+def drift_columns(stamp_ns: NDArray[np.int64], reference: NDArray[np.bool_], step: NDArray[np.int64]) -> Floats:
+    """(M, R) columns of the design: hat functions of time with a knot at the mean time of each reference state.
 
-    Before the first and after the last frame the figure is taken as constant. Rows sum to 1. With fewer than two
-    distinct reference times there is one column of ones: a constant figure. When the clock was set back during the
-    run, the order of the maps stands for the time.
+    Repeated maps of a state, which follow each other, share its knot. Before the first and after the last knot the
+    figure is taken as constant. Rows sum to 1. With fewer than two knots there is one column of ones: a constant
+    figure. When the clock was set back during the run, the order of the maps stands for the time.
+
+    Args:
+        step: (M,) index of the commanded state.
     """
     if (np.diff(stamp_ns) < 0).any():
         stamp_ns = np.arange(stamp_ns.size, dtype=np.int64)
-    knots = np.unique(stamp_ns[reference])
+    knots = np.unique([stamp_ns[reference & (step == state)].mean() for state in np.unique(step[reference])])
     if knots.size < 2:
         return np.ones((stamp_ns.size, 1))
     seconds = (stamp_ns - knots[0]) * 1e-9
@@ -112,7 +118,7 @@ def make_design(maps: MapSet) -> Design:
             f"no actuator was moved by {EXCITATION_MIN:g} or more in the {len(maps)} good maps: raise poke_amplitude, "
             "or add surfaces that move the actuators"
         )
-    drift = drift_columns(maps.stamp_ns, maps.reference)
+    drift = drift_columns(maps.stamp_ns, maps.reference, maps.step)
     if len(maps) < drift.shape[1] + count + DRIFT_SPARE_MAPS:
         drift = np.ones((len(maps), 1))
     unknowns = drift.shape[1] + count
@@ -166,11 +172,38 @@ def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats
     return usable, sag
 
 
+class SeenAlike(NamedTuple):
+    """Sampling points that the same maps have seen, by index; p unknowns, L maps without data there.
+
+    Attributes:
+        lost: (L, p) their rows of the orthonormal basis of the design.
+        inverse: (L, L) of 1 - lost lost^T; None where the other maps do not determine the unknowns.
+    """
+
+    points: NDArray[np.int64]
+    lost: Floats
+    inverse: Floats | None
+
+
+def seen_alike(design: Design, seen: NDArray[np.bool_]) -> list[SeenAlike]:
+    """All sampling points, sorted by which maps `seen` (M, P) have data there."""
+    projection = np.linalg.qr(design.matrix)[0]
+    _, first, which = np.unique(np.packbits(seen, axis=0), axis=1, return_index=True, return_inverse=True)
+    found = []
+    for number, rows in enumerate(seen[:, first].T):
+        lost = projection[~rows]
+        value, vector = np.linalg.eigh(np.eye(len(lost)) - lost @ lost.T)
+        inverse = (vector / value) @ vector.T if value.min(initial=1.0) > SEEN_MIN else None
+        found.append(SeenAlike(np.flatnonzero(which.ravel() == number), lost, inverse))
+    return found
+
+
 def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 
-    That is the expectation-maximisation form of least squares with missing data; a gap converges as fast as the other
-    maps, rather than its own, determine the fit there.
+    A point's fit is that to the maps which have seen it; the rounds are for piston and tilt of the maps, which go with
+    what is filled in. Where these maps do not determine the unknowns, what is filled in has its say, as in the
+    expectation-maximisation form of least squares with missing data, and begins from the terms of the maps.
 
     Returns:
         The regression, and its responses (M, K + P): coefficients, and sag without gaps, piston and tilt, m.
@@ -181,12 +214,18 @@ def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     if gaps.any():
         modes = basis(maps.points.x, maps.points.y)
         model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
-        projection = np.linalg.qr(design.matrix)[0]
+        projection, seen = np.linalg.qr(design.matrix)[0], np.isfinite(sag)
+        alike = seen_alike(design, seen)
         for _ in range(GAP_ROUNDS):
             before = filled[gaps]
             filled[gaps] = fill_gaps(sag[gaps], model, maps.points)
             if np.abs(filled[gaps] - before).max(initial=0.0) < GAP_TOLERANCE:  # NaN in the first round
                 break
-            model = projection[gaps] @ (projection.T @ filled)
+            solution = projection.T @ filled
+            data = projection.T @ np.where(seen, filled, 0.0)
+            for at, lost, inverse in alike:
+                if inverse is not None:
+                    solution[:, at] = data[:, at] + lost.T @ (inverse @ (lost @ data[:, at]))
+            model = projection[gaps] @ solution
     responses = np.hstack((maps.coefficients, filled))
     return least_squares(design, responses), responses

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.optics.aperture import find_aperture
+from dm_calibration.optics.aperture import InsufficientDataError, find_aperture
 from dm_common import Floats
 from dm_common.optics.zernike import MAX_ORDER
 
@@ -20,6 +20,8 @@ from dm_common.optics.zernike import MAX_ORDER
 ORDER = 12
 #: Pixels that the terms are fitted to, about.
 FITTED = 20_000
+#: Fewest pixels for each term: with less, noise and what the terms do not hold go into them, and no bound tells.
+PIXELS_A_TERM = 4
 #: Directions of the equations weaker than this are left open by the maps: turns that are almost alike.
 DETERMINED = 0.1
 #: Standard deviations that the largest error of the 18 coefficients of a calibration stays within in 95 % of cases.
@@ -65,6 +67,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
 
     Raises:
         ValueError: no tests, maps of different sizes, or maps in which every angular order is left open.
+        InsufficientDataError: the maps share no aperture, or too few of its pixels for the terms.
     """
     if len({test.sag.shape for test in tests}) != 1:
         raise ValueError(f"{len(tests)} maps: must be some, all of one size in pixels")
@@ -78,6 +81,11 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     place = aperture.places(*fitted)
     values = np.column_stack([_term(place, n, m) for n, m in orders])
     design = np.hstack((values.real, -values.imag[:, turning]))
+    if len(design) < PIXELS_A_TERM * design.shape[1]:
+        raise InsufficientDataError(
+            f"the maps share {len(design)} valid pixels: must be {PIXELS_A_TERM * design.shape[1]} or more, for "
+            f"{design.shape[1]} terms"
+        )
     heights = np.array([test.sag[fitted] for test in tests]).T
     measured = np.linalg.lstsq(design, heights, rcond=None)[0]
     seen = np.zeros((len(orders), 2, len(tests)))
@@ -96,7 +104,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         determined = np.isclose(np.diag(resolved), 1.0)[: 2 if m else 1]
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
-        squares += apart
+        squares += apart / ((n + 1) * (2 if m else 1))  # mean square over the disc
         if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
             judged += apart
             freedom += (2 if m else 1) * len(tests) - round(np.trace(resolved))

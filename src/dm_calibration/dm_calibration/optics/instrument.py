@@ -45,6 +45,8 @@ def without_retrace(sag: Floats, retrace: ArrayLike) -> Floats:
     Args:
         retrace: (36,) coefficients of the 18 terms beyond tilt for each m of edge sag by tilt in x, then in y.
     """
+    if not np.isfinite(sag).any():  # nothing tells the tilt, and nothing is to be corrected
+        return sag
     x, y, _ = _axes(sag.shape)
     added = np.zeros(len(TERMS))
     added[PISTON_TILT:] = _tilt(sag) @ np.asarray(retrace).reshape(2, -1)

@@ -13,6 +13,7 @@ import numpy as np
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.quality import GRADE_NOT_EXCITED
 from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
@@ -63,7 +64,9 @@ class ErrorPredictor:
         same = np.broadcast_to(signals, (count, actuators))
         fit = self.influence
         size = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)
-        mean, lower, upper = self.regression.fit.predict(np.column_stack((size, same)))
+        mean, lower, upper = self.regression.fit.predict(
+            np.column_stack((size, same[:, fit.grades != GRADE_NOT_EXCITED]))
+        )
         return (
             max(float(mean.mean()), 0.0),
             max(float(np.percentile(lower, 2.5)), 0.0),

@@ -57,7 +57,7 @@ class RunHistory:
         """
         self._maps = maps
         self._usable, self._sag = complete_sag(maps, model)
-        self._figure = drift_columns(maps.stamp_ns, maps.reference)
+        self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step)
         self._radius = np.array((0.0, *PLAY_RADII))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)

@@ -231,14 +231,14 @@ def _samples(
 ) -> tuple[Floats, Floats, Floats]:
     """Candidates, response and weights as arrays, of which a regression can be made, also with some `left_out`."""
     x, y = np.asarray(candidates, dtype=float), np.asarray(response, dtype=float)
-    if np.ptp(y) <= CONSTANT * np.abs(y).max():
-        raise ValueError(
-            "the response is the same for all samples, so there is nothing to explain: use samples that differ"
-        )
     if len(y) - left_out < FREEDOM_MIN + 2:
         raise TooFewMapsError(
             f"{len(y) - left_out} samples: a constant, one variable and {FREEDOM_MIN} degrees of freedom for the "
             f"residual need at least {FREEDOM_MIN + 2}; measure more surfaces"
+        )
+    if np.ptp(y) <= CONSTANT * np.abs(y).max():
+        raise ValueError(
+            "the response is the same for all samples, so there is nothing to explain: use samples that differ"
         )
     return x, y, np.ones(len(y)) if weights is None else np.asarray(weights, dtype=float)
 

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.quality import GRADE_NOT_EXCITED
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
@@ -150,10 +151,10 @@ def regress(
 def model_candidates(
     maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction
 ) -> tuple[tuple[str, ...], Floats]:
-    """`model` and the signals: their names, and (S, 1 + N)."""
+    """`model` and the signals of the N actuators that were moved: their names, and (S, 1 + N)."""
     model = rms(held_out_errors(maps, fit, errors, predict), maps.points.weight)
-    names = (MODEL, *(f"s{k + 1:02d}" for k in range(maps.actuators)))
-    return names, np.column_stack((model, errors.signals))
+    moved = np.flatnonzero(fit.grades != GRADE_NOT_EXCITED)
+    return (MODEL, *(f"s{k + 1:02d}" for k in moved)), np.column_stack((model, errors.signals[:, moved]))
 
 
 def held_out_errors(maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction) -> Floats:
