@@ -158,8 +158,12 @@ def test_the_map_limit_ends_it_with_the_best_command(rig: Rig) -> None:
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == ErrorCode.NOT_CONVERGED
     assert result.maps == len(rig.bench.measured) == 2
-    assert "not within the tolerance" in result.message
+    assert "not within the tolerance" in result.message and "at their limits" not in result.message
     assert len(result.signals) == 37
+    assert rig.host.focus.active is not None
+    furthest = rig.host.focus.active.reachable_range(FocusTarget(0.0), 2e-8)[1]
+    _, result = rig.run(converge(furthest, tolerance=1e-11, max_maps=1))
+    assert result.message.endswith("; actuators stand at their limits")
 
 
 def test_a_failed_map_is_tried_again_then_given_up(rig: Rig) -> None:

@@ -73,6 +73,21 @@ def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
     assert blind.state.crept_sigma == pytest.approx(np.full(len(CREEP_TIMES), UNSEEN))
 
 
+def test_a_controller_that_starts_anew_alone_knows_what_still_stands() -> None:
+    """The driver repeats the stamp of its last write, of a day before the record."""
+    never = held_for_a_day()
+    again = HysteresisObserver()
+    again.recall(record_of(never.law, never.state, DAY))
+    again.observe(report(0.0, 0.5, turns=1, heard=DAY + 60.0))
+    again.use(LAW, 0.0)
+    for changes in ({}, {"history_known": False}):
+        again.observe(report(0.0, 0.5, turns=1, heard=DAY + 120.0, **changes))
+        assert again.state is not None and never.state is not None
+        now, expected = (LAW.advance(state, DAY + 120.0) for state in (again.state, never.state))
+        assert now.crept == pytest.approx(expected.crept, abs=1e-6)
+        assert now.crept_sigma == pytest.approx(expected.crept_sigma, abs=1e-6)
+
+
 def test_after_a_short_power_cut_loops_go_on_lagging_from_where_they_were(tmp_path: Path) -> None:
     """Fast elements follow the signal too: within a second of no power they have not reached where it rests."""
     file = tmp_path / "mirror.creep.npz"
@@ -133,6 +148,21 @@ def test_while_the_link_is_lost_nobody_knows_whether_the_outputs_hold(away: floa
     assert observer.state is not None and (observer.state.crept_sigma[minute:] > 0.0).all() == bool(away)
 
 
+def test_what_stood_counts_until_the_first_write_of_a_degauss() -> None:
+    """The driver may say that it moves before that write, with the stamp of the one before."""
+    crept = []
+    for told_before in (False, True):
+        observer, swings = held_for_a_day(), {"turns": 1, "moving": True, "history_known": False}
+        if told_before:
+            observer.observe(report(0.0, 0.5, heard=DAY, **swings))
+        for time, signal in ((DAY, 0.49), (DAY + 1.0, -0.5)):
+            observer.observe(report(time, signal, heard=time, **swings))
+        observer.observe(report(DAY + 2.0, 0.0, turns=2, degausses=2))
+        assert observer.state is not None
+        crept.append(observer.state.crept)
+    assert crept[1] == pytest.approx(crept[0], abs=1e-6)
+
+
 def test_a_small_jump_of_the_clock_is_in_doubt_for_as_long_as_itself() -> None:
     """Not as long as the largest ever seen; a law that comes later says the same of both."""
     observer = held_for_a_day()
@@ -177,6 +207,15 @@ def test_a_record_of_another_law_or_mirror_is_not_used() -> None:
         assert (rested(LAW, np.zeros(3), 1.0, 0.0, record).crept == 0.0).all()
 
 
+def test_a_calibration_made_since_counts_for_more_than_a_record() -> None:
+    """It has seen the mirror after the record was written."""
+    law = replace(LAW, crept_at=50.0, crept=np.full(3, -0.6))
+    for record in (None, AT_REST):
+        assert rested(law, np.zeros(3), 60.0, 0.0, record).crept[0, -1] == pytest.approx(-0.6, abs=1e-3)
+    later = AT_REST._replace(time=55.0)
+    assert rested(law, np.zeros(3), 60.0, 0.0, later).crept[0, -1] == pytest.approx(0.0, abs=1e-3)
+
+
 def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_HOME", "/var/ros")
     assert record_file("", "a") is None
@@ -216,7 +255,11 @@ def test_a_record_is_kept_for_the_mirror_or_said_not_to_be(tmp_path: Path) -> No
         recorder.recall("a", 20.0)
         recorder.keep(40.0)
     wait_until(lambda: len(failures) == 2 and (tmp_path / "a.creep.npz").exists())
-    kept = read_record(tmp_path / "a.creep.npz", 50.0)
+    observer.observe(report(20.0, 0.5, history_known=False, active=False, linked=False, heard=50.0))
+    recorder.folder = str(tmp_path)
+    recorder.keep(60.0)  # nobody knows whether the outputs hold
+    recorder._disk.shutdown()
+    kept = read_record(tmp_path / "a.creep.npz", 70.0)
     assert kept is not None and kept.time == 40.0
     assert failures[1].startswith("state_folder: ")  # after what could not be read
 

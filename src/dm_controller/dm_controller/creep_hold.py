@@ -18,7 +18,7 @@ from dm_msgs.msg import ActuatorState
 
 from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
-from dm_controller.driver_monitor import same_signals
+from dm_controller.driver_monitor import DriverMonitor, same_signals
 from dm_controller.focus_types import Moment, Order, SendCommand
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
@@ -62,10 +62,25 @@ class CreepHold:
         sent = order.command.sent.time
         return max(sent + self._values["hold.period"], order.checked + CHECK_SHARE * (order.checked - sent))
 
+    def begin(self, order: Order, monitor: DriverMonitor) -> None:
+        """From its command on `order` is the last one; the one before stands until the driver has taken that."""
+        if (before := monitor.order) is not None and before.command is not None:
+            order.stood = before if before.command.confirmed else before.stood
+        monitor.order = self.order = order
+
+    def not_taken(self, monitor: DriverMonitor) -> None:
+        """The driver has not taken the last command: what stood before it is held on, if it still stands."""
+        stood = monitor.stood
+        self.end("the driver did not take the command")
+        if stood is not None:
+            monitor.order = self.order = stood
+
     def end(self, reason: str) -> None:
-        """Leave the shape as it stands."""
-        if self.order is not None and self.order.creep_held:
-            self.order.creep_held, self.ended = False, reason
+        """Leave the shape as it stands, and forget the one before."""
+        if self.order is not None:
+            self.order.stood = None
+            if self.order.creep_held:
+                self.order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
         """What the driver reports as its last request (N,): the hold ends when it is another's."""

@@ -80,6 +80,14 @@ class DriverMonitor:
         """s from a command to the driver's first write of it, median; 0 = not known."""
         return statistics.median(self._latencies) if self._latencies else 0.0
 
+    @property
+    def stood(self) -> Order | None:
+        """Whose shape the driver still reports, not having taken the last order's first command; None = nobody's."""
+        stood, report = self.order.stood if self.order is not None else None, self.latest
+        if stood is None or stood.command is None or report is None:
+            return None
+        return stood if same_signals(report.requested, stood.command.signals) else None
+
     def lost(self, reason: str) -> None:
         """What became of a driver that is known to be dead, as a sentence; "" = it may live."""
         self.gone = reason
@@ -171,6 +179,7 @@ class DriverMonitor:
         if order is None or order.command is None or order.answered or not (order.command.confirmed or replaced):
             return []
         order.answered, order.applied = True, order.command.confirmed
+        order.stood = None if order.applied else order.stood
         order.refusal = None if order.applied else Refusal(ErrorCode.PREEMPTED, replaced)
         return [PublishState(order)]
 
@@ -200,7 +209,7 @@ class DriverMonitor:
         if not self.keeps(order):
             return SUPERSEDED
         assert self.order is not None and self.order.command is not None  # else nothing keeps a shape
-        signals, last = order.move.signals, self.order.command.signals
+        signals, last = order.move.signals, self.order.command
         report = self.latest
         if report is not None and report.driver_state != ActuatorState.STATE_ACTIVE:
             return Progress(failed=_not_active(report))
@@ -211,13 +220,13 @@ class DriverMonitor:
             gap = float(np.abs(np.asarray(report.applied) - signals).max())
             order.gap = max(order.gap, gap)
             share = 1.0 - gap / order.gap if order.gap else 1.0
-            ours = any(same_signals(report.requested, own) for own in (signals, last))
+            ours = any(same_signals(report.requested, own) for own in (signals, last.signals))
             if ours and not report.moving:
                 return Progress(share=1.0, remaining=gap, stands=True)
-            if order.taken and not ours:
+            if not ours and (last.confirmed or last.given_up):
                 return SUPERSEDED
-            order.taken = ours
-        if waited > self._values["move_timeout"]:
+        # Since its last command: a correction for creep may come long after the first.
+        if now - last.sent.steady > self._values["move_timeout"]:
             text = report.message if report is not None else ""
             return Progress(failed=Refusal(ErrorCode.TIMEOUT, text or "the driver did not report the shape"))
         return Progress(share=share, remaining=gap)

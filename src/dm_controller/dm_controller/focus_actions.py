@@ -181,11 +181,8 @@ class MoveFocusAction:
         handle.publish_feedback(MoveFocus.Feedback(phase="settling", progress=1.0))
         if not sleep(node.get_clock(), goal.settle_time or self._values["settle_time"], lambda: self._to_stop(handle)):
             return self._stopped(handle, order)
-        with node.controller() as (controller, _now):
-            keeps = controller.monitor.keeps(order)
-        if not keeps:
-            return "abort", ErrorCode.PREEMPTED, "another command took over"
-        return "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
+        stands = f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
+        return self._follow(handle, order) or ("succeed", ErrorCode.OK, stands)
 
     def _follow(self, handle: WorkerGoal, order: Order) -> tuple[str, int, str] | None:
         """Wait until the shape of `order` stands; None when it does."""

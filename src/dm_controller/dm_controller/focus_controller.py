@@ -114,7 +114,7 @@ class FocusController:
             self.observer.observe(applied_from(report, now.time), self.monitor.clock_gain(report, now))
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
-        elif self.hold.active:
+        elif self.hold.active and self.monitor.stood is None:
             self.hold.driver_requested(report.requested, now.time)
         self._at_rest = None if report.moving else self.observer.estimate(now.time)
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
@@ -224,7 +224,7 @@ class FocusController:
         effects: list[Effect] = [order.command]
         if (before := self.monitor.order) is not None and not before.answered:
             effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
-        self.monitor.order = self.hold.order = order
+        self.hold.begin(order, self.monitor)
         return effects
 
     # --- a degauss on the way ---
@@ -233,7 +233,6 @@ class FocusController:
         """Have the mirror degaussed before `order` is carried out, unless it is already."""
         if not self.degauss_offered():
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "action degauss: pdm_driver does not offer it (yet)")
-        self.hold.end("the mirror is conditioned")
         effects: list[Effect] = []
         if (before := self.conditioning.wait(order)) is not None:
             before.pending = False
@@ -277,10 +276,11 @@ class FocusController:
             effects += self._degauss_ended(now, failure)
         order = self.monitor.order
         if order is not None and (untaken := self.monitor.untaken(now.steady)) is not None:
-            self.hold.end("the driver did not take the command")
+            self.hold.not_taken(self.monitor)
             # A correction, or the end of a move, is no answer to the request.
             effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
-        correction = self.hold.command(self.monitor.latest, self.observer.estimate, now)
+        report = None if self.conditioning.run else self.monitor.latest  # a correction would end a degauss
+        correction = self.hold.command(report, self.observer.estimate, now)
         return [*effects, *self._news(now), *([] if correction is None else [correction])]
 
     def quick_ticks(self, now: Moment) -> bool:

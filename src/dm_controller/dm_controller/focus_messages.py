@@ -17,6 +17,7 @@ from dm_controller.focus_controller import FocusController
 from dm_controller.focus_types import Moment, Order
 from dm_controller.forecast import HysteresisShare
 from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget
 
 #: What to do about an unknown history.
@@ -38,15 +39,17 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
     state.header.stamp = time_message(order.began.ns)
     if move is not None and active is not None:
         plan = move.plan
+        drift, drift_rms = (0.0, 0.0) if order.creep_held else (plan.drift, plan.drift_rms)
+        largest = plan.max_zernike_upper + drift
         state.calibration_id = active.calibration.id
         state.signals = doubles(plan.signals)
         state.predicted_rms = plan.rms
-        state.predicted_rms_lower, state.predicted_rms_upper = plan.rms_lower, plan.rms_upper
+        state.predicted_rms_lower, state.predicted_rms_upper = plan.rms_lower, plan.rms_upper + drift_rms
         if share is not None:
             state.predicted_rms_lower, upper = share.interval(request.curvature, plan.rms)
             state.predicted_rms_upper = max(plan.rms_upper, upper)
         state.predicted_max_zernike = plan.max_zernike
-        state.predicted_max_zernike_upper = plan.max_zernike_upper
+        state.predicted_max_zernike_upper = largest
         state.predicted_duration = move.duration
         state.saturated = bool(plan.saturated.any())
         state.saturated_actuators = array.array("I", (np.flatnonzero(plan.saturated) + 1).astype("uint32").tobytes())
@@ -57,9 +60,10 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
         first = "the mirror is degaussed first; " if order.pending else ""
         text = (
             f"{first}{request.curvature:+.4f} 1/m stands in about {move.duration:.2g} s, right to "
-            f"{plan.max_zernike_upper * 1e9:.1f} nm (largest coefficient, 95 %)"
+            f"{largest * 1e9:.1f} nm (largest coefficient, 95 %)"
         )
-        most = f"most of that for {plan.most}" if plan.most else ""
+        source = "creep, which nothing corrects" if drift > 0.5 * largest else plan.most
+        most = f"most of that for {source}" if source else ""
         state.message = "; ".join(filter(None, (text, most, remarks(active, order.unknown, values, order.began.ns))))
     if refusal is not None:
         state.error_code, state.message, state.creep_held = refusal.error_code, str(refusal), False
@@ -97,6 +101,25 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
     return "; ".join(filter(None, (nowhere(controller.active, values["reachable_tolerance"]), remark)))
 
 
+def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -> float:
+    """95 % bound of the largest coefficient error of the shape of `order`, which stands, m."""
+    was, active, observer = order.active, controller.active, controller.observer
+    assert was is not None  # else it had been refused
+    plan, planner = move.plan, was.planner
+    largest, spread = plan.max_zernike, plan.max_zernike_upper - plan.max_zernike
+    if active is not None and active.calibration.id == was.calibration.id:
+        # Maps since may have shown another figure, or that the calibration errs by more than it said.
+        planner = active.planner
+        after, before = (used.mirror.predict(move.target, move.effective).max_zernike for used in (active, was))
+        worse = planner.error_bound(True) ** 2 - was.planner.error_bound(True) ** 2
+        largest, spread = max(0.0, largest + after - before), math.hypot(spread, math.sqrt(max(0.0, worse)))
+    drift = 0.0 if order.creep_held else plan.drift
+    if drift and observer.state is not None and observer.law.same_as(was.planner.law):
+        drift = planner.drift(observer.state, now.time, move.effective)
+    # What was written again after a lost link is on another branch of the hysteresis than it was found for.
+    return largest + planner.error_bound(not observer.unknown or not move.known, spread) + drift
+
+
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment, missing: str = "") -> Health:
     """The health of the node whose parameters are `values`, and what is `missing` beside it, as a sentence.
 
@@ -111,17 +134,12 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment, 
     }
     order, report = controller.monitor.order, controller.monitor.latest
     if order is not None and order.move is not None and order.kept and report is not None:
-        assert order.command is not None and order.active is not None  # it is the last that went out
+        assert order.command is not None  # it is the last that went out
         if same_signals(report.requested, order.command.signals):
-            plan, known = order.move.plan, not controller.observer.unknown
-            # What was written again after a lost link is on another branch of the hysteresis than it was found for.
-            error = order.active.planner.error_bound(
-                known or not order.move.known, plan.max_zernike_upper - plan.max_zernike
-            )
             figures |= {
                 "curvature": order.move.target.curvature,
                 "age": f"{now.time - order.began.time:.1f}",
-                "bound": plan.max_zernike + error,
+                "bound": _bound(controller, order, order.move, now),
             }
     text = "; ".join(filter(None, (trouble(controller, values, now), missing)))
     return Health(WARN if text else OK, text or "ready", figures)

@@ -1,5 +1,7 @@
 """What goes into the focus controller and what comes out of it, without ROS."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -68,11 +70,11 @@ class Order:
         pending: the mirror is degaussed first.
         applied: the driver has confirmed the command.
         answered: what came of its command has been said.
-        taken: the driver was seen to follow its command.
         gap: largest distance from its shape seen, normalised.
         command: the last one for its shape; None = none went out.
         creep_held: its shape is corrected for creep from its command on, until that is ended.
         checked: s, ROS time, when creep was looked at last.
+        stood: whose shape stands on if the driver does not take the first command, until it has; None = nobody's.
         kept: its move was not stopped.
     """
 
@@ -85,11 +87,11 @@ class Order:
     pending: bool = False
     applied: bool = False
     answered: bool = False
-    taken: bool = False
     gap: float = 0.0
     command: SendCommand | None = None
     creep_held: bool = False
     checked: float = 0.0
+    stood: Order | None = None
     kept: bool = True
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from dm_msgs.action import MoveFocus
 from dm_msgs.msg import (
     ActuatorHysteresis,
     ActuatorState,
@@ -28,10 +29,12 @@ from dm_msgs.msg import (
 from std_msgs.msg import Header
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.hysteresis.creep_record import CreepRecord
+from dm_common.hysteresis.creep_record import UNSEEN, CreepRecord, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.messages import doubles, time_message
 from dm_common.optics.zernike import basis
+from dm_controller import focus_actions
 from dm_controller.focus_actions import START_S, FocusHost
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health, state_message
@@ -46,6 +49,7 @@ from dm_controller.focus_types import (
     StartDegauss,
 )
 from dm_controller.loop_actions import LoopBench
+from dm_controller.planning.target import FocusTarget
 
 ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3
 #: Of the actuators, in aperture radii.
@@ -565,6 +569,36 @@ def test_what_is_offered_is_what_requests_are_promised() -> None:
     assert plan.max_zernike_upper == pytest.approx(plan.max_zernike + offered)
 
 
+def test_what_was_never_reported_is_known_no_better_than_after_the_first_report(bench: Bench) -> None:
+    fresh = FocusController(VALUES)
+    fresh.use(calibration(), MIRROR)
+    never, _ = fresh.request(FocusRequest(curvature=0.02), bench.now, dry_run=True)
+    first = Bench().ask(0.02, dry_run=True)
+    assert move_of(never).plan.max_zernike_upper > 0.99 * move_of(first).plan.max_zernike_upper
+    degaussed = ActuatorEstimate(None, "not reported").after_degauss(LAW, ACTUATORS, 0.0, 0.0).state
+    assert degaussed is not None and (degaussed.crept_sigma == UNSEEN).all()
+
+
+def test_an_unknown_history_is_bounded_where_all_actuators_come_from_the_same_side() -> None:
+    """As after the largest sphere, where the mirror is taken to be demagnetised."""
+    weight = np.concatenate(([0.88], np.full(20, 0.019)))[:, None]
+    law = HysteresisModel(np.linspace(0.0, 0.975, 21), weight, np.zeros(0), 0.0, 0.0, np.zeros(0))
+    message = calibration("still", law)
+    message.hysteresis.unknown_sigma = 0.04  # of such loops, over any history
+    bench = Bench()
+    bench.do(bench.controller.use(message, MIRROR))
+    assert bench.controller.active is not None
+    planner, state = bench.controller.active.planner, law.demagnetised(ACTUATORS, 0.0)
+    furthest = bench.controller.active.reachable_range(FocusTarget(0.0), 2e-8)[1]
+    for curvature in (furthest, 0.0):
+        state = law.move(state, planner.plan(FocusTarget(curvature), state, 0.0).signals, 0.0)
+    for share in (0.0, 0.2):
+        target = FocusTarget(share * furthest)
+        move = planner.plan(target, rested(law, state.signals, 0.0), 0.0, known=False)
+        error = planner.drift(law.move(state, move.signals, 0.0), 0.0, move.effective)
+        assert 0.6 * move.plan.max_zernike_upper < error < move.plan.max_zernike_upper
+
+
 def test_lost_turns_make_the_history_unknown(bench: Bench) -> None:
     bench.turns += 5
     bench.move(np.full(ACTUATORS, 0.1))
@@ -763,6 +797,43 @@ def test_a_driver_that_does_not_take_the_command(bench: Bench) -> None:
     assert not bench.controller.hold.active
 
 
+def replaced(bench: Bench) -> None:
+    bench.move(np.full(ACTUATORS, 0.1))
+
+
+def corrected(bench: Bench) -> None:
+    bench.wait(20.0)
+
+
+@pytest.mark.parametrize(
+    ("accident", "code"),
+    [
+        (stopped, ErrorCode.DRIVER_INACTIVE),
+        (silent, ErrorCode.DRIVER_UNAVAILABLE),
+        (replaced, ErrorCode.PREEMPTED),
+        (Bench.degauss, ErrorCode.PREEMPTED),
+        (corrected, ErrorCode.OK),
+    ],
+)
+def test_a_shape_that_is_lost_while_it_settles_is_no_success(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, accident: Callable[[Bench], object], code: int
+) -> None:
+    server = SimpleNamespace(preempted=lambda _handle: False)
+    monkeypatch.setattr(focus_actions, "WorkerActionServer", lambda *_arguments, **_fields: server)
+    monkeypatch.setattr(focus_actions, "sleep", lambda *_arguments: accident(bench) is None)
+    node: Any = SimpleNamespace(
+        await_start=lambda: None,
+        order=lambda request: bench.ask(request.curvature),
+        answer=lambda order: state_message(order, VALUES, None),
+        controller=lambda: nullcontext((bench.controller, bench.now)),
+        get_clock=lambda: None,
+    )
+    goal = MoveFocus.Goal(request=FocusRequest(curvature=0.02))
+    handle: Any = SimpleNamespace(request=goal, is_cancel_requested=False, publish_feedback=lambda _feedback: None)
+    outcome, error_code, _ = focus_actions.MoveFocusAction(node, VALUES)._carry_out(handle, MoveFocus.Result())
+    assert (outcome, error_code) == ("abort" if code else "succeed", code)
+
+
 def test_an_order_that_takes_too_long(bench: Bench) -> None:
     order = bench.ask(0.01)
     bench.report(moving=True)
@@ -788,6 +859,37 @@ def test_a_held_shape_is_corrected_for_creep(bench: Bench) -> None:
     assert bench.error(effective) < 0.05 * drifted
     assert bench.controller.monitor.progress(order, bench.time).stands
     assert len(bench.outcomes) == 1
+    bench.obeys, sent = False, len(bench.commands)
+    while len(bench.commands) == sent:
+        bench.time += 0.02
+        bench.report()
+        bench.do(bench.controller.tick(bench.now))
+    under_way = bench.controller.monitor.progress(order, bench.time)
+    assert not under_way.stands and under_way.failed is None
+    bench.move(bench.commands[-1].signals)
+    assert bench.controller.monitor.progress(order, bench.time).stands
+
+
+def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) -> None:
+    bench.history_known = False
+    bench.report()
+    order = bench.ask(0.02)
+    bench.wait(1.0)
+    bench.ask(0.01, time_budget=60.0)
+    sent = len(bench.commands)
+    bench.wait(5.0)
+    assert len(bench.commands) == sent  # a correction would end the degauss
+    refused(bench)
+    bench.wait(5.0)
+    assert len(bench.commands) > sent and bench.error(move_of(order).effective) < 1e-4
+    bench.obeys = False
+    bench.ask(0.01)
+    bench.obeys = True
+    bench.wait(5.0)
+    assert bench.refusal().error_code == ErrorCode.PREEMPTED and bench.outcomes[-1].request.curvature == 0.01
+    assert bench.error(move_of(order).effective) < 1e-4
+    told = health(bench.controller, VALUES, bench.now).values
+    assert (told["curvature"], told["held"]) == (0.02, True)
 
 
 def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:
@@ -853,6 +955,50 @@ def test_health_says_what_stands_as_long_as_it_does() -> None:
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values
 
 
+def test_the_bound_of_what_stands_follows_the_calibration(bench: Bench) -> None:
+    def bound(message: Calibration) -> float:
+        bench.do(bench.controller.use(message, MIRROR))
+        bench.wait(1.0)
+        return float(str(health(bench.controller, VALUES, bench.now).values["bound"]))
+
+    bench.time += 3e7
+    bench.report()
+    bench.ask(0.02)
+    bench.wait(1.0)
+    before, erring, bent, figure = bound(calibration()), calibration(), calibration(), np.zeros(21)
+    erring.hysteresis.held_out_max_zernike = 60e-9
+    assert bound(erring) > 1.4 * 60e-9
+    figure[4] = 30e-9
+    bent.zernike_offset = doubles(figure)
+    bent.sag_offset = doubles(basis(np.asarray(bent.sample_x), np.asarray(bent.sample_y)) @ figure)
+    assert bound(bent) == pytest.approx(before + 30e-9, rel=1e-3)
+
+
+def test_the_bound_holds_where_nothing_holds_the_shape() -> None:
+    """With the law known in full; what is held keeps the bound of the plan."""
+    told = []
+    for held in (True, False):
+        bench = Bench(**{"hold.enable": held})
+        bench.degauss()
+        bench.time += 3e7
+        bench.report()
+        bench.mirror = LAW.advance(bench.mirror, bench.time)
+        order = bench.ask(0.02)
+        told.append(state_message(order, VALUES, None))
+    assert bench.controller.active is not None and [state.creep_held for state in told] == [True, False]
+    planner, plan = bench.controller.active.planner, move_of(order).plan
+    assert told[0].predicted_max_zernike_upper == plan.max_zernike_upper
+    assert told[0].predicted_rms_upper == plan.rms_upper < told[1].predicted_rms_upper
+    assert told[1].message.endswith("most of that for creep, which nothing corrects")
+    for age in (99.0, 3600.0):
+        bench.wait(age, 10.0)
+        error = planner.drift(bench.mirror, bench.time, move_of(order).effective)
+        bound = float(str(health(bench.controller, VALUES, bench.now).values["bound"]))
+        assert bound == pytest.approx(error + plan.max_zernike_upper, rel=1e-3)
+        if age < 100.0:
+            assert plan.max_zernike_upper < error < told[1].predicted_max_zernike_upper < 1.1 * bound
+
+
 def test_a_shape_written_again_after_a_lost_link_is_told_with_the_bound_of_an_unknown_history() -> None:
     bench = Bench()
     bench.degauss()
@@ -866,4 +1012,4 @@ def test_a_shape_written_again_after_a_lost_link_is_told_with_the_bound_of_an_un
     told = health(bench.controller, VALUES, bench.now).values
     assert (told["curvature"], told["held"]) == (0.02, False)
     assert bench.controller.active is not None
-    assert float(str(told["bound"])) > max(bound, bench.controller.active.planner.unknown_max_zernike)
+    assert float(str(told["bound"])) > max(bound, bench.controller.active.planner.error_bound(False, 0.0))

@@ -107,6 +107,8 @@ def rested(
     settled = np.repeat(moved.position[:, None], len(law.creep_time), axis=1)
     lagged = np.repeat(signals[:, None], len(law.lag_time), axis=1)
     sigma = np.full(len(law.creep_time), UNSEEN)
+    if record is not None and record.time < law.crept_at <= time and law.crept.shape == signals.shape:
+        record = None  # the calibration has seen the mirror since
     if record is None or record.time > time or not np.array_equal(record.creep_time, law.creep_time):
         held = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
         record = CreepRecord(law.crept_at, law.creep_time, held, np.zeros(len(law.creep_time)), held)
@@ -169,8 +171,14 @@ class CreepRecorder:
         self._observer.recall(record, another)
 
     def keep(self, now: float) -> None:
-        """Have what the actuators have crept to by `now` (s) put on disk, if there is anything to keep."""
-        file = record_file(self.folder, self._serial) if self._serial is not None else None
+        """Have what the actuators have crept to by `now` (s) put on disk, if there is anything to keep.
+
+        Without a link to the electronics the last record stands: nobody knows whether the outputs hold.
+        """
+        latest = self._observer.latest
+        if self._serial is None or latest is None or not latest.linked:
+            return
+        file = record_file(self.folder, self._serial)
         record = record_of(self._observer.law, self._observer.state, now)
         if file is not None and record is not None:
             self._disk.submit(self._write, file, record)

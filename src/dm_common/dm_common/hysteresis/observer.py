@@ -56,7 +56,10 @@ class HysteresisTracker:
         if self.state is not None and len(report.signals) != len(self.state.signals):
             raise ValueError(f"applied: {len(report.signals)} signals, before there were {len(self.state.signals)}")
         if last is None or self.state is None:
-            self.state = rested(self.law, report.signals, report.time, self._middle, self._record)
+            record, time = self._record, report.time
+            if record is not None and time < record.time <= report.heard:
+                time = record.time  # made of this very shape, which was written before and still stands
+            self.state = rested(self.law, report.signals, time, self._middle, record)
             self.unknown = "it moved before this node followed it"
             return
         if last.linked:
@@ -66,7 +69,7 @@ class HysteresisTracker:
             state = self.law.advance(self.state, self.law.crept_at)
             crept = np.repeat(self.law.crept[:, None], len(self.law.creep_time), axis=1)
             self.state, self._set_off = replace(state, crept=crept, crept_sigma=0.0 * state.crept_sigma), None
-        if report.time < self.state.time:
+        if report.time < last.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)
         if report.turns < last.turns or report.degausses < last.degausses:
@@ -77,7 +80,9 @@ class HysteresisTracker:
         if report.degausses > last.degausses:
             self._degaussed(report, last)
             return
-        if report.moving and (not last.moving or report.turns > last.turns):
+        # Until its first write, whose stamp says when, a move has not begun: what stood goes on.
+        unwritten = self._set_off is not None and np.array_equal(last.signals, self._set_off.signals)
+        if report.moving and (not last.moving or report.turns > last.turns or unwritten):
             self._set_off = self.law.advance(self.state, report.time)
         if not report.history_known:
             # Without a link, nobody knows whether the outputs held: the unit may have had no power.
@@ -132,9 +137,9 @@ class ActuatorEstimate(NamedTuple):
         return not self.unknown
 
     def after_degauss(self, law: HysteresisModel, actuators: int, time: float, middle: float) -> ActuatorEstimate:
-        """The actuators after a degauss that ends at `time` (s)."""
-        state, fresh = self.state, law.demagnetised(actuators, time, middle)
-        return ActuatorEstimate(fresh if state is None else law.degaussed(state, time, middle), "")
+        """The actuators after a degauss that ends at `time` (s); what they held before may not have been seen."""
+        state = self.state or rested(law, np.full(actuators, middle), time, middle)
+        return ActuatorEstimate(law.degaussed(state, time, middle), "")
 
 
 class Observed(NamedTuple):

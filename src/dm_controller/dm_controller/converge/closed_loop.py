@@ -100,7 +100,6 @@ class LoopStep:
         error: measured minus wanted.
         max_zernike: largest coefficient error beyond tilt, m.
         rms: sag error at the sampling points, piston and tilt removed, m.
-        overflow: of the command, see `Command`.
     """
 
     map: int
@@ -108,7 +107,6 @@ class LoopStep:
     error: Shape
     max_zernike: float
     rms: float
-    overflow: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +180,7 @@ def converge(
     options = options or LoopOptions()
     model = solver.model
     wanted = target_shape(target, model)
-    command = solver.command(target)
-    signals, overflow = (command.signals, command.overflow) if start is None else (start, 0.0)
+    signals = solver.command(target).signals if start is None else start
     steps: list[LoopStep] = []
     damping, scale = 1.0, 1.0
     drift = response(model, np.zeros_like(signals))
@@ -198,7 +195,7 @@ def converge(
         number = len(steps) + 1
         measured = plant.measure(f"converge {number}")
         error = measured_shape(measured.coefficients, measured.sag, model) - wanted
-        step = LoopStep(number, signals, error, error.max_zernike, rms_sag(error, model), overflow)
+        step = LoopStep(number, signals, error, error.max_zernike, rms_sag(error, model))
         if steps:
             asked = response(model, signals - steps[-1].signals)
             ratio = response_ratio(asked, error - steps[-1].error - drift)
@@ -221,8 +218,7 @@ def converge(
             drift = response(model, creep.foreseen())
         better = solver.correct(signals, error + drift)
         # Beyond the full step only as far as the limits go.
-        moved = solver.limited(signals + scale * damping * (better.signals - signals))
-        signals, overflow = moved.signals, max(better.overflow, moved.overflow)
+        signals = solver.limited(signals + scale * damping * (better.signals - signals)).signals
         if used_up:
             break
     if signals is not steps[-1].signals:

@@ -92,7 +92,8 @@ class ConvergeRun:
         )
         if outcome.converged:
             return ErrorCode.OK, figures
-        limited = "; actuators stand at their limits" if best.overflow > 0.0 else ""
+        at_limit = self._bench.active_calibration().mirror.limits.at_limit(best.signals)
+        limited = "; actuators stand at their limits" if at_limit.any() else ""
         restored = "; the best command was written again" if outcome.restored else ""
         return ErrorCode.NOT_CONVERGED, f"not within the tolerance: {figures}{limited}{restored}"
 

@@ -127,6 +127,16 @@ class CreepError:
         most = bool(ONE**2 * unseen[worst, :count].max() > 0.5 * largest[worst])
         return CreepBound(float(np.sqrt(largest[worst])), ONE * float(np.sqrt(rms.max())), most)
 
+    def drift(self, moved: HysteresisState, effective: Floats) -> tuple[float, float]:
+        """Largest coefficient and rms sag, m, at AGES of what creep does to a shape that nothing holds.
+
+        It should stand at `effective` (N,), and has just gone to the state `moved`.
+        """
+        law = self._law
+        gaps = [law.effective(law.advance(moved, moved.time + age)) - effective for age in AGES]
+        errors, count = self._rows @ np.transpose(gaps), self._coefficients
+        return float(np.abs(errors[:count]).max()), float(np.linalg.norm(errors[count:], axis=0).max())
+
 
 def _default_covariance(law: HysteresisModel) -> Floats:
     """Covariances where the calibration holds none: its gains hold what fast elements follow at once."""

@@ -17,6 +17,7 @@ import numpy as np
 from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
+from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
@@ -94,7 +95,6 @@ class Planner:
         self.mirror, self.hysteresis, self.slew_rate = mirror, hysteresis, slew_rate
         self.law = hysteresis.law if hysteresis is not None else HysteresisModel.linear()
         self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[PISTON_TILT:])
-        self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
         self._closed_form = ClosedForm(mirror)
         self._prepared: PreparedInverse | None = None
         self._limits = within(mirror.limits) if hysteresis is not None else mirror.limits
@@ -124,7 +124,7 @@ class Planner:
         """The move to `target` that begins at `time` (s) from `state`.
 
         Args:
-            state: None = unknown altogether; then the mirror is taken to be degaussed.
+            state: None = unknown altogether; then the mirror is taken to be degaussed, after shapes that nobody saw.
             known: whether the state can be trusted; if not, the bounds are widened.
             effective: (N,) effective signals to aim at instead of the model's own (a recipe).
             ahead: s after the way at which the shape is to be right; creep is quickest just after a move.
@@ -148,7 +148,8 @@ class Planner:
         if state is not None:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         if state is None:
-            state, known = law.demagnetised(len(aim), time, mirror.limits.middle), False
+            middle, known = mirror.limits.middle, False
+            state = rested(law, np.full(len(aim), middle), time, middle)
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
         signals, missed = aim, None
@@ -171,6 +172,8 @@ class Planner:
             if law.creep_rate:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
+                drift, drift_rms = self._creep_error.drift(law.move(at, signals, arrival), reached)
+                plan = replace(plan, drift=drift, drift_rms=drift_rms)
             return self._bounded(plan, signals, known, creep, error)
 
         return Move(target, signals, reached, largest, known, travel + ahead, predict)
@@ -222,15 +225,18 @@ class Planner:
         self.creep_shown = CreepShown(state.time, state.crept, state.crept_sigma, share)
 
     @cached_property
-    def _creep_error(self) -> CreepError:
-        """Relative to shapes as large as the mirror takes, of the sign that it takes further."""
+    def _whole(self) -> Floats:
+        """(N,) effective signals of a sphere as large as the mirror takes, of the sign that it takes further."""
         sphere = FocusTarget(0.0)
         ends = self.mirror.reachable_range(sphere, RANGE_TOLERANCE)
         far = max((end for end in ends if math.isfinite(end)), key=abs, default=0.0)
-        whole = self.mirror.command(sphere.with_curvature(far))[0]
+        return self.mirror.command(sphere.with_curvature(far))[0]
+
+    @cached_property
+    def _creep_error(self) -> CreepError:
         from dm_controller.planning.creep_error import CreepError  # a command does not wait for it
 
-        return CreepError(self.law, self._zernike, self.mirror.sag_root, whole, self.creep_shown)
+        return CreepError(self.law, self._zernike, self.mirror.sag_root, self._whole, self.creep_shown)
 
     def error_bound(self, known: bool, error: float | None = None) -> float:
         """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not.
@@ -241,11 +247,13 @@ class Planner:
         if error is None:
             found, model = self.hysteresis, self.mirror.model
             error = model.held_out_max_zernike if found is None else self.law.in_use * found.held_out_max_zernike
-        return math.hypot(error, 0.0 if known else self.unknown_max_zernike)
+        return math.hypot(error, 0.0 if known else self._unknown_history[0])
 
     def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:
         crept, crept_rms = (creep.max_zernike, creep.rms) if creep is not None else (0.0, 0.0)
-        rms_spread = math.hypot(self.mirror.model.held_out_rms, 0.0 if known else self._unknown_rms, crept_rms / 1.96)
+        rms_spread = math.hypot(
+            self.mirror.model.held_out_rms, 0.0 if known else self._unknown_history[1], crept_rms / 1.96
+        )
         largest_spread = self.error_bound(known, None if error is None else error - plan.max_zernike)
         most = ""
         if creep is not None and crept > MUCH * largest_spread:
@@ -262,12 +270,18 @@ class Planner:
             most=most,
         )
 
+    @cached_property
     def _unknown_history(self) -> tuple[float, float]:
-        """95 % quantile of the largest coefficient error, and rms sag error, when the history is not known; m."""
+        """95 % bound of the largest coefficient error, and rms sag error, when the history is not known; m.
+
+        The larger of those of actuators that err each by itself, and all as one: a focus moves them together.
+        """
         if self.hysteresis is None:
             return 0.0, 0.0
         model, sigma = self.mirror.model, self.hysteresis.unknown_sigma
         miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
         largest = np.abs(miss @ model.influence_zernike[PISTON_TILT:].T).max(axis=1)
         area = model.sample_weight[:, None] * np.square(model.influence_sag)
-        return float(np.quantile(largest, 0.95)), float(sigma * np.sqrt(area.sum()))
+        together = 1.96 * sigma * self._largest(self._whole), sigma * np.linalg.norm(self.mirror.sag_root @ self._whole)
+        apart = np.quantile(largest, 0.95), sigma * np.sqrt(area.sum())
+        return float(max(apart[0], together[0])), float(max(apart[1], together[1]))
