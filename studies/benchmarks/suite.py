@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -49,14 +49,15 @@ def run(
         ValueError: an unknown name, with the known ones.
     """
     figures: dict[str, Any] = {"machine": machine(), "quick": effort.quick}
-    for name, job in _chosen(names):
+    for name, job in chosen(names):
         step(name)
         figures |= job(effort, rivals)
     return figures
 
 
-def _chosen(names: list[str]) -> Iterator[tuple[str, Job]]:
+def chosen(names: list[str]) -> list[tuple[str, Job]]:
+    """The jobs of these names in order; empty = all. Raises ValueError for an unknown name, with the known ones."""
     unknown = sorted(set(names) - JOBS.keys())
     if unknown:
         raise ValueError(f"--only {', '.join(unknown)}: must be one of {', '.join(JOBS)}")
-    return ((name, job) for name, job in JOBS.items() if not names or name in names)
+    return [(name, job) for name, job in JOBS.items() if not names or name in names]

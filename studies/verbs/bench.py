@@ -75,16 +75,19 @@ def bench(
     Figures of time are those of this machine at this moment; what is measured takes turns, so its ratios hold.
     """
     from studies.benchmarks import rivals as others
-    from studies.benchmarks.suite import JOBS, run
+    from studies.benchmarks.suite import chosen, run
     from studies.benchmarks.targets import rows
     from studies.benchmarks.timing import Effort
 
+    names = [name for name, _job in chosen(only or [])]
+    if plot is not None and "scaling" not in names:
+        raise typer.BadParameter("draws what the job scaling measures: give --only scaling too", param_hint="--plot")
     started = time.monotonic()
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
     effort = Effort(rounds=12, quick=True) if quick else Effort()
     found = others.load(root, rivals and not quick, console.print)
     with progress_bar(steady=False) as bar:  # a thread that draws would take time from what is measured
-        task = bar.add_task("bench", total=len(only or JOBS))
+        task = bar.add_task("bench", total=len(names))
         done = -1
 
         def step(name: str) -> None:
@@ -92,11 +95,11 @@ def bench(
             done += 1
             bar.update(task, completed=done, description=f"bench: {name}", refresh=True)
 
-        figures = run(only or [], effort, found, step)
-        bar.update(task, completed=len(only or JOBS), description="bench: done", refresh=True)
+        figures = run(names, effort, found, step)
+        bar.update(task, completed=len(names), description="bench: done", refresh=True)
     lines = rows(figures)
     show(lines, figures)
-    if plot is not None and "scaling" in figures:
+    if plot is not None:
         from studies.benchmarks.figure import save_scaling
 
         console.print(f"plot: {save_scaling(figures, plot)}")

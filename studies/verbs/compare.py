@@ -12,6 +12,14 @@ import typer
 
 from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
 
+#: Options by the one that asks for their table, "" = none does; `seed` and `json` go with all.
+TABLES = {
+    "hysteresis": ("plant", "creep", "pixels", "quick"),
+    "mirrors": ("maps", "quick"),
+    "autofocus": (),
+    "": ("plant", "method", "creep", "max_maps", "pixels"),
+}
+
 
 class Plant(StrEnum):
     """Hysteresis laws of the simulation; `all` = all with hysteresis, for the ablation."""
@@ -83,6 +91,7 @@ def show(comparison: Any) -> None:
 
 
 def compare(
+    context: typer.Context,
     plant: Annotated[Plant, typer.Option(help="Hysteresis law of the simulation.")] = Plant.prandtl_ishlinskii,
     seed: Annotated[
         list[int] | None, typer.Option(min=0, help="Seed of a simulation; repeat it for several. Default: 1.")
@@ -127,6 +136,13 @@ def compare(
     """
     if maps and (quick or not mirrors):
         raise typer.BadParameter("only with --mirrors, and without --quick", param_hint="--maps")
+    table = next(name for name in TABLES if not name or context.params[name])
+    for name in context.params.keys() - {table, *TABLES[table], "seed", "json"}:
+        asked = context.params[name] if name in TABLES else True  # 0 asks for no table
+        source = context.get_parameter_source(name)
+        if asked and source is not None and source.name == "COMMANDLINE":
+            hint = f"--{name.replace('_', '-')}"
+            raise typer.BadParameter(f"without effect {f'with --{table}' if table else 'alone'}", param_hint=hint)
     if mirrors or autofocus:
         if seed and len(seed) > 1:
             raise typer.BadParameter("here it is the first of the seeds: give one", param_hint="--seed")

@@ -118,7 +118,12 @@ def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_
     refused = CliRunner().invoke(make_app(), ["instrument", "flats", str(table), "--write", str(target)])
     assert refused.exit_code == 2 and "tell no flat from another" in " ".join(refused.output.split())
     table.write_text("\n".join([*rows[:2], rows[2] + "77"]))
+    for read in (table, rows[1].partition(",")[0]):
+        refused = CliRunner().invoke(make_app(), ["instrument", "flats", str(table), "--write", str(read)])
+        assert refused.exit_code == 2 and "is read for this" in " ".join(refused.output.split())
+    target.write_text("of before")
     assert run("flats", table, "--write", target)["reference_surface"] == str(target)
+    assert (tmp_path / "flat.fits.before").read_text() == "of before"
     reference = load_reference(str(target), "", 632.8e-9, 1e-12)
     assert Ingest().read(file, replace(SETTINGS, reference=reference))[1].reference_surface.startswith("flat.fits, SHA")
 

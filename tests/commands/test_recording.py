@@ -10,8 +10,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,6 +35,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
+from typer.testing import CliRunner
 
 from described_mirror import mirror_info_of
 from dm_calibration.calibration_messages import calibration_message
@@ -43,11 +46,13 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
 from dm_common.messages import doubles, taken, time_message
 from dm_common.ros import qos
+from dm_tools.cli import make_app
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagError, BagReader, BagWriter, Message, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 from dm_tools.recording.player import play, replayed
 from dm_tools.recording.recorder import Recorder
 from dm_tools.recording.session import COMPARED, _parameters, differences, read_session, recalibrate
+from dm_tools.verbs.record import record
 from dm_tools.verbs.replay import _again
 from recorded_bench import recorded
 from support import Observer, wait_until
@@ -352,6 +357,24 @@ def test_commands_are_held_back() -> None:
         replayed(topics, ["focus_request"])
 
 
+def test_of_two_mirrors_only_the_one_that_is_named_is_published() -> None:
+    topics = ["/left/zernike", "/right/zernike", "/left/actuator_command", "/diagnostics", "/rosout"]
+    assert replayed(topics, namespace="left") == ["/left/zernike", "/diagnostics"]
+    assert replayed(topics, ["zernike", "/right/zernike"], namespace="/left/") == ["/left/zernike", "/right/zernike"]
+    with pytest.raises(ValueError, match="namespace middle: no topic of the recording is in it"):
+        replayed(topics, namespace="middle")
+
+
+def test_what_is_for_publishing_is_refused_where_nothing_is_published(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", [("/left/actuator_state", ActuatorState())])
+    command = ["replay", str(tmp_path / "bag")]
+    for option in (["--rate", "2"], ["--topics", "zernike"], ["--commands"]):
+        refused = CliRunner().invoke(make_app(), [*command, "--recalibrate", *option])
+        assert refused.exit_code == 2 and "are for publishing" in " ".join(refused.output.split())
+    with pytest.raises(ValueError, match="namespace middle"):
+        CliRunner().invoke(make_app(), [*command, "--namespace", "middle"], catch_exceptions=False)
+
+
 def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain: int, tmp_path: Path) -> None:
     latched = observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
     stream = observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
@@ -387,12 +410,28 @@ def test_what_was_recorded_is_in_the_file_though_nothing_follows(
     observer: Observer, domain: int, tmp_path: Path
 ) -> None:
     stream = observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-    with Recorder(tmp_path / "bag", topics=["actuator_state"], domain=domain) as recorder:
+    with Recorder(tmp_path / "bag", topics=["actuator_state", "actuator_stat"], domain=domain) as recorder:
         wait_until(stream.get_subscription_count, 60)
         for number in range(2):
             stream.publish(ActuatorState(sequence=number))
         wait_until(lambda: recorder.counts.get("/actuator_state") == 2, 60)
         wait_until(lambda: BagReader(tmp_path / "bag").messages == 2, 5, "both in the file")
+    assert recorder.unseen == ["/actuator_stat"]
+
+
+def test_names_that_nobody_publishes_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("signal.signal", lambda *_arguments: None)
+    folder = tmp_path / "bag"
+    for counts in {PARAMETER_EVENTS: 3}, {PARAMETER_EVENTS: 3, "/zernike": 1}:
+        folder.mkdir()
+        running = SimpleNamespace(counts=counts, unseen=["/zernik"], refused={}, check=lambda: None)
+        manager = nullcontext(running)
+        monkeypatch.setattr("dm_tools.recording.recorder.Recorder", lambda *_arguments, found=manager: found)
+        with nullcontext() if "/zernike" in counts else pytest.raises(RuntimeError, match="--topics names nothing"):
+            record(folder, "zernik,zernike", duration=0.01)
+        assert "not recorded /zernik: nobody published it" in capsys.readouterr().out
 
 
 def test_a_failure_of_the_writer_is_told(

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from dm_common.ros.executor import BackgroundExecutor
 from dm_controller.focus_controller_node import FocusControllerNode
@@ -25,6 +27,7 @@ from studies.benchmarks.ros_jobs.ros_processes import laboratory
 from studies.benchmarks.suite import JOBS, run
 from studies.benchmarks.targets import TARGETS, rows
 from studies.benchmarks.timing import Effort, medians
+from studies.verbs.bench import bench
 
 pytestmark = pytest.mark.slow
 
@@ -127,6 +130,23 @@ def test_rivals_that_are_not_there_are_skipped_with_a_word(tmp_path: Path, monke
     said: list[str] = []
     assert rivals.load(tmp_path, True, said.append) == {}
     assert said == ["skipped, because they are not installed: nothing (requirements/bench.txt names the versions)"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--only", "sping"], "--only sping: must be one of"),
+        (["--only", "fit", "--plot", "x.png"], "--plot: draws what the job scaling measures"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_is_installed(
+    arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rivals, "load", lambda *_arguments: pytest.fail("installs"))
+    app = typer.Typer()
+    app.command()(bench)
+    result = CliRunner().invoke(app, arguments)
+    assert words in f"{result.output} {result.exception}"
 
 
 def test_the_stand_ins_of_a_request_make_the_controller_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

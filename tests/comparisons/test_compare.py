@@ -173,6 +173,12 @@ def test_bad_options_are_refused(fields: dict[str, object], words: str) -> None:
         (["--seed", "1", "--seed", "1"], "name each seed once"),
         (["--creep", "nan"], "'--creep'"),
         (["--pixels", "10"], "'--pixels'"),
+        (["--quick"], "--quick: without effect"),
+        (["--mirrors", "1", "--autofocus", "2"], "--autofocus: without effect"),
+        (["--hysteresis", "--mirrors", "1"], "--mirrors: without effect"),
+        (["--hysteresis", "--max-maps", "2"], "--max-maps: without effect"),
+        (["--mirrors", "1", "--creep", "0"], "--creep: without effect with --mirrors"),
+        (["--autofocus", "1", "--quick"], "--quick: without effect"),
     ],
 )
 def test_the_command_refuses_before_it_begins(arguments: list[str], words: str) -> None:

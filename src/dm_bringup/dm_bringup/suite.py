@@ -23,6 +23,8 @@ Config = dict[str, dict[str, Any]]
 RESTART_S, RESTART_MAX_S, SETTLED_S = 0.5, 30.0, 60.0
 #: Exit status of a node that could not be made: what it was configured with is wrong, see `dm_common.ros.executor`.
 NOT_MADE = 1
+#: The parameter file that the nodes are started with; a file of the user in the same folder must not be called so.
+AS_STARTED = "as_started.yaml"
 
 
 class ConfigError(ValueError):
@@ -126,14 +128,14 @@ class Suite:
 
     def __enter__(self) -> Self:
         self.folder.mkdir(parents=True, exist_ok=True)
-        save_config(self._config, self.folder / "config.yaml")
+        save_config(self._config, self.folder / AS_STARTED)
         for node in nodes_of(self._config):
             if node.name in self._nodes:
                 self._start(node.name)
         return self
 
     def _start(self, name: str) -> None:
-        arguments = ["--ros-args", "--params-file", str(self.folder / "config.yaml"), *self._remap]
+        arguments = ["--ros-args", "--params-file", str(self.folder / AS_STARTED), *self._remap]
         if self._namespace:
             arguments += ["-r", f"__ns:=/{self._namespace.rstrip('/')}"]
         self._processes[name] = self._process(name, arguments)

@@ -64,14 +64,18 @@ def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:
     return told, [times[2 * k + 1] - times[2 * k] for k in range(count)]
 
 
-def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..., Suite]) -> None:
+def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..., Suite], tmp_path: Path) -> None:
     code = "import sys; print(sys.argv[1:], flush=True); sys.stdin.read()"
+    mine = tmp_path / "run" / "config.yaml"
+    mine.parent.mkdir()
+    mine.write_text("# logs are to lie beside it\n")
     with run(code, namespace="/left", remap=["image_raw:=/camera/image_raw"]) as suite:
         deadline = time.monotonic() + 30.0
         while not suite.log("calibration").read_text() and time.monotonic() < deadline:
             time.sleep(0.01)
         told = suite.log("calibration").read_text()
     assert "'-r', 'image_raw:=/camera/image_raw', '-r', '__ns:=/left'" in told
+    assert mine.read_text() == "# logs are to lie beside it\n"
     with pytest.raises(ValueError, match="remap: 'image_raw': must be of the form from:=to"):
         run(code, remap=["image_raw"])
 

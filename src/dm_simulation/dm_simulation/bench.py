@@ -13,7 +13,7 @@ from dm_common.values import parameter, real, switch, text
 from dm_simulation.camera import CameraConfig, SceneCamera
 from dm_simulation.electronics.drive_unit import DriveConfig, DriveUnit
 from dm_simulation.electronics.monitor import Monitor, MonitorConfig
-from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
+from dm_simulation.electronics.server import OFF, SEVERE, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx, prune
@@ -108,7 +108,7 @@ class VirtualBench:
             reference.mkdir(exist_ok=True)
             deliver(self._map_file(self.interferometer.reference(), ".datx", 0), reference / "flat.datx", 0.0)
         self.electronics = ElectronicsServer(
-            self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith("malformed"), text)
+            self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith(SEVERE), text)
         )
         try:
             self.trigger = None if config.trigger_port == OFF else TriggerServer(config.trigger_port, self.measure)
@@ -155,7 +155,7 @@ class VirtualBench:
         """
         if self.camera is None:
             raise ValueError("camera.rate = 0: this bench has no camera")
-        return self.camera.expose(self.interferometer.surface(self.displacement()))
+        return self.camera.expose(self.interferometer.true_surface(self.displacement()))
 
     def measure(self, path: Path | None = None) -> Path:
         """Measure the surface at this moment and write the map file; the suffix of `path` gives the format.

@@ -23,6 +23,7 @@ from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_simulation.mirror.piezo import PiezoConfig
 from dm_simulation.parameters import PARAMETERS, bench_config
+from waiting import wait_until
 
 FOLDER = Path(dm_simulation.__file__).parent
 
@@ -99,6 +100,18 @@ def test_a_frame_moves_the_mirror_and_the_map_shows_it(make: Make) -> None:
     np.testing.assert_allclose((after - before)[both], expected[both], atol=0.5e-9)  # DAC steps
     assert bench.monitor.record.violations == 0
     assert np.isnan(before).sum() != np.isnan(expected).sum()  # dropouts
+
+
+def test_a_frame_that_cannot_be_carried_out_is_severe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[tuple[bool, str]] = []
+    config = BenchConfig(ports=PortsConfig(-1, 0, -1), files=FilesConfig(folder=tmp_path), trigger_port=-1)
+    bench = VirtualBench(config, Clock(), lambda severe, text: events.append((severe, text)))
+    monkeypatch.setattr(bench.monitor, "watch", lambda _signals: 1 / 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.sendto(b"\xff" * 5 + bytes(81), ("127.0.0.1", int(bench.endpoints["udp_port"])))
+    wait_until(lambda: events, 10.0)
+    bench.close()
+    assert events == [(True, "failed, ZeroDivisionError: division by zero")]
 
 
 def test_true_wiring_decides_which_actuator_moves(make: Make) -> None:

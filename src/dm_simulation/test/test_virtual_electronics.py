@@ -153,6 +153,8 @@ def test_settings_frames_change_the_outputs_and_are_counted() -> None:
         (DriveConfig(wiring=(*TRIHEX[:-1], 40)), "wiring"),
         (DriveConfig(dac_volts_at_full=0.0), "dac_volts_at_full"),
         (DriveConfig(volts_max=0.0), "volts.max"),
+        (DriveConfig(volts_min=-300.0, squared=True), "volts.max squared - volts.min squared"),
+        (DriveConfig(amplifier_min=500.0), "amplifier_min = 500 V: must be below electronics.amplifier_max, 400 V"),
     ],
 )
 def test_inconsistent_configurations_are_refused(config: DriveConfig, name: str) -> None:

@@ -143,6 +143,22 @@ def test_true_sag_is_the_measurement_without_its_errors(plate: Plate) -> None:
     np.testing.assert_array_equal(camera.true_sag(poke(20)), camera.measure(poke(20)))
 
 
+def test_the_reference_is_what_a_perfect_flat_shows(plate: Plate) -> None:
+    camera = make(replace(QUIET, instrument_error=30e-9, distortion=0.03, rotate_deg=90), plate)
+    np.testing.assert_array_equal(camera.reference(), camera.measure(np.zeros(37)))
+
+
+def test_scale_and_place_of_the_maps_are_not_those_of_the_surface(plate: Plate) -> None:
+    figured = replace(QUIET, figure_rms=40e-9, mount_angle=0.5)
+    well, off = make(figured, plate), make(replace(figured, mount_scale=1.05, mount_x=4e-4), plate)
+    at_true = well.true_surface(poke(20)) - well.true_surface(np.zeros(37))
+    np.testing.assert_allclose(off.true_surface(poke(20)) - off.true_surface(np.zeros(37)), at_true, atol=1e-18)
+    figure, seen = (camera.true_surface(np.zeros(37)).ravel() for camera in (well, off))
+    np.testing.assert_allclose(seen / np.linalg.norm(seen), figure / np.linalg.norm(figure), atol=1e-12)
+    assert np.abs(off.surface(poke(20)) - off.true_surface(poke(20))).max() > 1e-8
+    np.testing.assert_array_equal(well.true_surface(poke(20)), well.surface(poke(20)))
+
+
 def test_a_field_larger_than_the_plate_is_refused(plate: Plate) -> None:
     with pytest.raises(ValueError, match=r"field_diameter = 0.04 m: must not exceed the mirror, 0.03 m"):
         make(replace(QUIET, field_diameter=0.040), plate)

@@ -72,7 +72,11 @@ def test_the_zero_drifts_to_its_end() -> None:
 
     np.testing.assert_array_equal(figure(0.0), 0.0)
     assert np.abs(figure(1e4)).max() == pytest.approx(2e-7)
-    np.testing.assert_allclose(figure(100.0), (1 - np.exp(-1)) * figure(1e4))
+    assert np.abs(figure(-1e5)).max() == pytest.approx(2e-7), "a clock that jumps back"
+    early = made(drift=2e-7, drift_time=100.0)
+    early.advance(100.0)
+    drifted = early.influence_at(early.x, early.y) @ early.displacement
+    np.testing.assert_allclose(drifted, (1 - np.exp(-1)) * figure(1e4))
 
 
 def test_electrodes_beyond_the_edge_are_refused() -> None:

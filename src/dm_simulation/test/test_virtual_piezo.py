@@ -150,6 +150,8 @@ def test_preisach_equals_a_crowd_of_relays() -> None:
 def test_unknown_laws_and_impossible_loops_are_refused() -> None:
     with pytest.raises(ValueError, match=r"piezo.law = 'magic'.*prandtl_ishlinskii"):
         Hysteresis("magic", 0.1, 1)
+    with pytest.raises(ValueError, match=r"creep_fastest = 10 s: must not exceed piezo\.creep_slowest, 5 s"):
+        PiezoActuators(PiezoConfig(creep_fastest=10.0, creep_slowest=5.0), np.random.default_rng(1), np.zeros(1))
     with pytest.raises(ValueError, match=r"piezo.hysteresis = 0.9"):
         Hysteresis("prandtl_ishlinskii", 0.9, 1)
 
@@ -282,6 +284,17 @@ def test_a_clock_that_jumps_back_does_not_age_the_mirror() -> None:
     assert actuators.displacement[0] == before
     actuators.advance(6.0)
     assert actuators.displacement[0] > before
+
+
+def test_temperature_and_drift_go_on_from_a_start_at_any_time_and_through_clocks_that_jump_back() -> None:
+    config = replace(DRAWN, creep=0.0, drift=5e-9)
+    first, second = (PiezoActuators(config, np.random.default_rng(3), np.zeros(4), start) for start in (0.0, 21600.0))
+    np.testing.assert_array_equal(second.displacement, first.displacement)
+    first.advance(5000.0)
+    for time in (25000.0, 100.0, 1700.0):
+        second.advance(time)
+    assert second.temperature == pytest.approx(first.temperature, abs=1e-9)
+    np.testing.assert_allclose(second.displacement, first.displacement, rtol=0.0, atol=1e-15)
 
 
 def full_loops(actuators: PiezoActuators, grid: Array, seconds: float = 0.0) -> tuple[Array, Array]:

@@ -125,6 +125,7 @@ def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
 def test_the_oldest_maps_go_and_nothing_else(tmp_path: Path) -> None:
     maps = [tmp_path / f"measure_{number}_1.dat" for number in range(3)] + [tmp_path / "map_000001.datx"]
     others = [tmp_path / "my_map.dat", tmp_path / "measure_notes.dat", tmp_path / "map_1.txt"]
+    others.append(tmp_path / "map_2024-05-01_before_repair.datx")
     for number, path in enumerate([*others, *maps]):
         path.write_bytes(bytes(100))
         os.utime(path, (number, number))

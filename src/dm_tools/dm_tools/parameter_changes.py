@@ -79,10 +79,17 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
         console.print(f"no parameter has to be changed: {target} is not written")
         return
     text = edited(source.read_text(), values_of(parameters))
+    keep_before(target)
+    write_whole(target.resolve(), text.encode())
+    console.print(f"{target} is written from {source}: start the nodes with it, then check again")
+
+
+def keep_before(target: Path) -> None:
+    """Keep what stands at `target`, if anything does, beside it under a free name. Raises OSError."""
+    from dm_common.atomic_write import write_whole
+
     if target.exists():
         kept = (target.with_name(f"{target.name}.before{number}") for number in chain([""], count(2)))
         before = next(path for path in kept if not path.exists())
         write_whole(before, target.read_bytes())
         console.print(f"{target} as it was is kept as {before}")
-    write_whole(target.resolve(), text.encode())
-    console.print(f"{target} is written from {source}: start the nodes with it, then check again")

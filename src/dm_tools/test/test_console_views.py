@@ -7,6 +7,7 @@ import io
 import json
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,8 @@ from dm_msgs.msg import (
     ZernikeCoefficients,
 )
 from matplotlib.image import imread
+from nicegui import Client
+from nicegui.page import page as nicegui_page
 from sensor_msgs.msg import Image
 
 import console_stand_in
@@ -38,9 +41,12 @@ from dm_tools.console.charts.plots import INK, SAG_COLOURS, heat_map, loop_chart
 from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import SHOWN_S, Session
-from dm_tools.console.state_observer import StateObserver
+from dm_tools.console.state_observer import EffectiveSignals, StateObserver
 from dm_tools.console.style import CSS
+from dm_tools.console.surface_view import SurfaceView
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
+from dm_tools.console.widgets.actuators import ActuatorCards
+from dm_tools.console.widgets.focus import FocusCard
 from dm_tools.running_suite import NEEDED
 from dm_tools.verify import map_of
 from ros_fixtures import Observer
@@ -289,6 +295,8 @@ def test_a_poke_turns_back_where_the_range_ends() -> None:
     assert view_models.poke_signals([0.0, 0.9], 2, 0.3, -1.0, 1.0) == pytest.approx([0.0, 0.6])
     with pytest.raises(ValueError, match="actuator = 3: must be 1 to 2"):
         view_models.poke_signals([0.0, 0.0], 3, 0.3, -1.0, 1.0)
+    with pytest.raises(ValueError, match=r"amplitude = 30: from \+0\.000 both ways leave the range -1 to \+1"):
+        view_models.poke_signals([0.0, 0.0], 2, 30.0, -1.0, 1.0)
 
 
 def test_the_loop_opens_as_the_law_says() -> None:
@@ -310,6 +318,8 @@ def test_the_loop_is_that_of_the_actuator_that_was_chosen() -> None:
 def test_a_measured_way_comes_back_and_stays_inside() -> None:
     signals = way(0.8, 0.5, -1.0, 1.0)
     assert max(signals) == 1.0 and signals[-1] == pytest.approx(0.8)
+    with pytest.raises(ValueError, match="amplitude = 2"):
+        way(0.8, 2.0, -1.0, 1.0)
     values = modelled_way(LAW, LAW.demagnetised(COUNT, 0.0), 2, way(0.0, 1.0, -1.0, 1.0))
     assert values[0] < values[2]  # the same signal, rising and falling
 
@@ -387,6 +397,103 @@ def test_a_move_that_the_controller_does_not_follow_is_doubtful() -> None:
     estimate.play = estimate.play[:-1]  # of no mirror at all
     observer.take(estimate)
     assert "actuator_estimate" in observer.now(9.0).doubt
+
+
+@pytest.fixture
+def page() -> Iterator[None]:
+    """A page that no browser shows."""
+    with Client(nicegui_page("")):
+        yield
+
+
+def session_of(observer: Any) -> tuple[Session, list[str]]:
+    """A console without nodes, and the titles of what it was asked to do."""
+    ros: Any = SimpleNamespace(observer=observer, external_action="", snapshot=bench, take_log=lambda *_line: None)
+    session, begun = Session(ros), []
+    session.begin = lambda title, *_others, **_more: begun.append(title)  # type: ignore[method-assign]
+    return session, begun
+
+
+def bench(message: Calibration | None = None) -> Snapshot:
+    """An active bench, with this calibration."""
+    everything = dict.fromkeys(NEEDED, DiagnosticStatus())
+    able = Capabilities(calibration_id="c19")
+    shape = state([0.0] * COUNT)
+    return Snapshot(
+        mirror_info=mirror_info(), actuator_state=shape, calibration=message, capabilities=able, health=everything
+    )
+
+
+@pytest.mark.usefixtures("page")
+def test_a_poke_moves_the_actuator_in_the_field_of_its_page() -> None:
+    session, begun = session_of(StateObserver())
+    here, there = ActuatorCards(session), ActuatorCards(session)
+    for cards in (here, there):
+        cards.refresh(bench())
+    here._number.set_value(5)
+    there._poke()  # its field says 1 until it is refreshed
+    here._start_loop()
+    there.refresh(bench())
+    assert there._number.value == 5
+    there._poke()
+    assert begun == ["Poke 1", "Loop of actuator 5", "Poke 5"]
+    here._number.set_value(9)
+    here._poke()
+    here._number.set_value(None)
+    here._start_loop()
+    assert len(begun) == 3
+    assert [failure.sentence for failure in session.failures] == [
+        "number = 9: must be a whole number, 1 to 7",
+        "number: must be a whole number, 1 to 7",
+    ]
+
+
+@pytest.mark.usefixtures("page")
+def test_the_loop_comes_back_with_its_law_and_its_doubt_follows() -> None:
+    settled = EffectiveSignals(np.zeros(COUNT), "moves were lost")
+    observer = SimpleNamespace(law=LAW, fault="", now=lambda _time: settled)
+    cards = ActuatorCards(session_of(observer)[0])
+    message, _ = calibration()
+    cards.refresh(bench(message))
+    assert cards._loop_text.text.endswith("is a guess: moves were lost.") and cards._loop_picture._shown is not None
+    settled = settled._replace(doubt="")
+    cards.refresh(bench(message))
+    assert cards._loop_text.text.endswith("is where it stands.")
+    observer.law = HysteresisModel.linear()
+    cards.refresh(bench(message))
+    assert cards._loop_picture._shown is None
+    observer.law = LAW
+    cards.refresh(bench(message))
+    assert cards._loop_picture._shown is not None
+
+
+@pytest.mark.usefixtures("page")
+def test_a_prediction_goes_with_its_wish() -> None:
+    session, _ = session_of(StateObserver())
+    focus = FocusCard(session)
+    focus._asking = True  # nothing is asked of nodes
+    focus._wish = focus._predicted = (0.0, 0.0, focus._mode.value)
+    focus._prediction.show("Predicted residual 5.0 nm rms")
+    focus.refresh(bench())
+    assert focus._prediction.text
+    focus._number.set_number(-0.04)
+    focus.refresh(replace(bench(), health={}))
+    assert not focus._prediction.text
+
+
+def test_nothing_is_subtracted_from_a_map_of_another_aperture() -> None:
+    message, influence = calibration()
+    settled = EffectiveSignals(np.zeros(COUNT), "")
+    observer: Any = SimpleNamespace(creep_unseen=False, at=lambda _time: settled, now=lambda _time: settled)
+    sag, info = map_of_terms(influence[:, 0])
+    image = Image(encoding="32FC1", height=300, width=300, step=1200, data=sag.astype(np.float32).tobytes())
+    view = SurfaceView(observer)
+    view.update(replace(bench(message), surface_map=image, surface_map_info=info))
+    assert view.predicted_zernike is not None
+    info.aperture_radius = 10e-3
+    view = SurfaceView(observer)
+    view.update(replace(bench(message), surface_map=image, surface_map_info=info))
+    assert "Not comparable" in str(view.difference) and view.predicted_zernike is None
 
 
 def test_charts_are_described_and_have_axes() -> None:

@@ -59,14 +59,20 @@ class DriveUnit:
         last = config.channels - 1
         if len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
             raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to {last}")
+        low, high = self._signal_range
+        square = " squared" if config.squared else ""
         for name, value in (
             ("electronics.dac_volts_at_full - electronics.dac_volts_at_zero", self._span),
             ("electronics.amplifier_gain", config.amplifier_gain),
-            ("volts.max - volts.min", config.volts_max - config.volts_min),
-            ("electronics.amplifier_max - electronics.amplifier_min", config.amplifier_max - config.amplifier_min),
+            (f"volts.max{square} - volts.min{square}", high - low),
         ):
             if value == 0:
                 raise ValueError(f"{name} = 0: must not be zero")
+        if config.amplifier_min >= config.amplifier_max:
+            raise ValueError(
+                f"electronics.amplifier_min = {config.amplifier_min:g} V: must be below electronics.amplifier_max, "
+                f"{config.amplifier_max:g} V"
+            )
         self._wiring = wiring
         at_rest = np.clip(-config.dac_volts_at_zero / self._span, 0, 1)
         #: Outputs as fractions of the DAC's range; a unit of few channels still has the registers of an EDAC40.
@@ -80,6 +86,15 @@ class DriveUnit:
     @property
     def _span(self) -> float:
         return self.config.dac_volts_at_full - self.config.dac_volts_at_zero
+
+    @property
+    def _power(self) -> int:
+        return 2 if self.config.squared else 1
+
+    @property
+    def _signal_range(self) -> tuple[float, float]:
+        """What signals -1 and +1 stand for: V, or V^2."""
+        return self.config.volts_min**self._power, self.config.volts_max**self._power
 
     def take_edac40(self, frame: frames.EdacFrame) -> None:
         """Carry out an EDAC40 frame. Only value frames belong to normal running; the others are counted."""
@@ -112,6 +127,5 @@ class DriveUnit:
 
     def signals(self) -> Array:
         """Normalised signals (N,) that the actuators really get; beyond -1..+1 when driven too far."""
-        config, power = self.config, 2 if self.config.squared else 1
-        low, high = config.volts_min**power, config.volts_max**power
-        return 2 * (self.actuator_volts() ** power - low) / (high - low) - 1
+        low, high = self._signal_range
+        return 2 * (self.actuator_volts() ** self._power - low) / (high - low) - 1

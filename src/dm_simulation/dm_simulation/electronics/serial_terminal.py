@@ -34,6 +34,10 @@ class SerialTerminal:
         on_update: Callable[[], None],
         reject: Callable[[str, str], None],
     ) -> None:
+        if framed.channels > len(unit.outputs):
+            raise ValueError(
+                f"framed.channels = {framed.channels}: must not exceed electronics.channels, {unit.config.channels}"
+            )
         self._unit = unit
         decoder = FramedDecoder(framed) if framed.channels else None
         self._take = frames.take_dac40 if decoder is None else decoder.take

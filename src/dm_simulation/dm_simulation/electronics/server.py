@@ -26,6 +26,8 @@ LOOPBACK = "127.0.0.1"
 #: Port value that leaves a service out; 0 lets the system choose one.
 OFF = -1
 PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
+#: How events begin that tell of something wrong: what is no frame, or could not be carried out.
+SEVERE = ("malformed", "failed")
 DISCOVERY_QUESTION = b"Discovery: Who is out there?"
 DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 
@@ -49,7 +51,7 @@ class ElectronicsServer:
 
     Args:
         on_update: called in the server's thread after every frame that was carried out.
-        on_event: called with a line of text when something worth a log line happens.
+        on_event: called with a line of text when something worth a log line happens; a severe one begins with SEVERE.
 
     Attributes:
         endpoints: actual "tcp_port", "udp_port", "discovery_port" and "pty", as far as they are offered.
@@ -77,7 +79,7 @@ class ElectronicsServer:
         self._client: socket.socket | None = None
         self._datagrams: list[socket.socket] = []
         self._stream = bytearray()
-        self._loop = EventLoop("electronics", lambda error: on_event(f"{type(error).__name__}: {error}"))
+        self._loop = EventLoop("electronics", lambda error: on_event(f"failed, {type(error).__name__}: {error}"))
         self._terminal = SerialTerminal(unit, ports.framed, self._loop, on_update, self._reject)
         try:
             self._loop.run(self._plug)

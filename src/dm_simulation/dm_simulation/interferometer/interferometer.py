@@ -8,7 +8,7 @@ pixel centres: about 3 ms for 944 x 944 pixels, and no influence maps to keep in
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -139,7 +139,7 @@ class Interferometer:
         true_y, true_x = -centres[:, None] * share, centres * share
         self._true_pixels = 0.5 * config.pixels * (np.array((-true_y, true_x)) + 1.0) - 0.5  # row, column
         if config.mask_diameter:
-            x, y = self._on_mirror(true_x * self._field_radius, true_y * self._field_radius)
+            x, y = self._on_mirror(true_x * self._field_radius, true_y * self._field_radius, config)
             self._outside |= np.hypot(x, y) > config.mask_diameter / 2
         self._columns = chebyshev.chebvander(centres, degree)
         self._rows = self._columns[::-1].copy()
@@ -152,21 +152,27 @@ class Interferometer:
         def interpolate(values: Array) -> Array:
             return np.einsum("py,qx,yxk->kpq", inverse, inverse, values, optimize=True)
 
-        metres_x, metres_y = self._on_mirror(x * self._field_radius, y * self._field_radius)
-        self._influence = interpolate(plate.influence_at(metres_x, metres_y))
+        aligned = replace(config, mount_x=0.0, mount_y=0.0, mount_scale=1.0)
+        places = [self._on_mirror(x * self._field_radius, y * self._field_radius, each) for each in (config, aligned)]
+        self._influence = interpolate(plate.influence_at(*places[0]))
+        self._true_influence = self._influence if aligned == config else interpolate(plate.influence_at(*places[1]))
         # Over the field disc: piston, two tilts, then orders 2 to 5.
         self._low_orders = interpolate(zernike.evaluate(x, y, zernike.terms_to_order(5)))
         terms = zernike.terms_to_order(12)[3:]
 
-        def drawn(x: Array, y: Array, size: float, terms: tuple[zernike.Term, ...] = terms) -> Array:
+        def drawn(size: float, *places: tuple[Array, Array], terms: tuple[zernike.Term, ...] = terms) -> list[Array]:
+            """One shape as it is at each of these places of the nodes; `size` is its rms at the first of them."""
             amplitudes = figure_rng.standard_normal(len(terms)) / np.array([term.n for term in terms]) ** 1.5
-            shape = interpolate((zernike.evaluate(x, y, terms) @ amplitudes)[..., None])[0]
-            inside = self._evaluate(shape)[self.aperture]
-            return np.asarray(shape * (size / np.sqrt(np.mean((inside - inside.mean()) ** 2))))
+            shapes = [interpolate((zernike.evaluate(*at, terms) @ amplitudes)[..., None])[0] for at in places]
+            inside = self._evaluate(shapes[0])[self.aperture]
+            return [shape * (size / np.sqrt(np.mean((inside - inside.mean()) ** 2))) for shape in shapes]
 
-        self._figure = drawn(metres_x / plate.radius, metres_y / plate.radius, config.figure_rms)
-        self._error = drawn(x, y, config.instrument_error)
-        self._retrace = np.array([drawn(x, y, config.retrace, zernike.terms_to_order(5)[3:]) for _ in range(2)])
+        self._figure, self._true_figure = drawn(
+            config.figure_rms, *((along_x / plate.radius, along_y / plate.radius) for along_x, along_y in places)
+        )
+        (self._error,) = drawn(config.instrument_error, (x, y))
+        low_terms = zernike.terms_to_order(5)[3:]
+        self._retrace = np.array([drawn(config.retrace, (x, y), terms=low_terms)[0] for _ in range(2)])
         self._lasting, self._measured = np.zeros(len(self._low_orders) - 3), -np.inf
         # Sag at the edge by tilt, as a sum over coefficients of products: mean of f x over that of x^2.
         inside = np.where(x**2 + y**2 <= 1, 1.0, 0.0)
@@ -175,9 +181,9 @@ class Interferometer:
             [products.T @ (inside * along) @ products / (inside * along**2).sum() for along in (x, y)]
         )
 
-    def _on_mirror(self, x: Array, y: Array) -> tuple[Array, Array]:
+    @staticmethod
+    def _on_mirror(x: Array, y: Array, mount: InterferometerConfig) -> tuple[Array, Array]:
         """Places of the field (m) in the frame of the mirror as it is mounted."""
-        mount = self.config
         x, y = (x - mount.mount_x) / mount.mount_scale, (y - mount.mount_y) / mount.mount_scale
         cosine, sine = np.cos(mount.mount_angle), np.sin(mount.mount_angle)
         x, y = cosine * x + sine * y, cosine * y - sine * x
@@ -193,12 +199,16 @@ class Interferometer:
         return other
 
     def surface(self, displacement: Array) -> Array:
-        """The true surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
+        """The surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
 
         Returns:
             Sag in m as coefficients (p, q) of T_p(y) T_q(x), x and y in units of the field's radius.
         """
         return np.tensordot(displacement, self._influence, 1) + self._figure
+
+    def true_surface(self, displacement: Array) -> Array:
+        """The same in true lengths about the mirror's own centre, as whoever looks by another way sees it."""
+        return np.tensordot(displacement, self._true_influence, 1) + self._true_figure
 
     def _evaluate(self, coefficients: Array) -> Array:
         return (self._rows @ coefficients) @ self._columns.T
@@ -212,14 +222,18 @@ class Interferometer:
 
     def true_sag(self, displacement: Array) -> Array:
         """The noise-free surface (pixels, pixels), m, as the camera shows it, NaN outside: for judging only."""
-        return self._shown(self.surface(displacement))
+        return self._shown(self._evaluate(self.surface(displacement)))
 
     def reference(self) -> Array:
         """The instrument's error (pixels, pixels), m: what it would show of a perfect flat without noise."""
-        return self._shown(self._error)
+        return self._shown(self._distorted(self._evaluate(self._error)))
 
-    def _shown(self, coefficients: Array) -> Array:
-        sag = self._evaluate(coefficients)
+    def _distorted(self, sag: Array) -> Array:
+        if not self.config.distortion:
+            return sag
+        return np.asarray(map_coordinates(sag, self._true_pixels, order=3, mode="nearest"))
+
+    def _shown(self, sag: Array) -> Array:
         sag[self._outside] = np.nan
         return self._camera(sag)
 
@@ -239,9 +253,7 @@ class Interferometer:
         self._lasting, self._measured = low[3:], time
         seen = self.surface(displacement) + self._error + np.tensordot(low, self._low_orders, 1)
         seen += np.tensordot(np.tensordot(self._tilts, seen, 2), self._retrace, 1)
-        sag = self._evaluate(seen)
-        if config.distortion:
-            sag = map_coordinates(sag, self._true_pixels, order=3, mode="nearest")
+        sag = self._distorted(self._evaluate(seen))
         if config.vibration:
             amplitude = config.vibration * rng.lognormal(0.0, VIBRATION_SPREAD)
             sag += amplitude * np.sin(8.0 * np.pi / config.wavelength * sag + rng.uniform(0.0, 2.0 * np.pi))

@@ -7,6 +7,7 @@ big-endian). `.datx`: HDF5 as Mx writes it.
 import contextlib
 import io
 import os
+import re
 import struct
 import time
 from pathlib import Path
@@ -25,7 +26,7 @@ RESOLUTION = (4096, 32768, 131072)
 #: What Mx stores where there is no data.
 NO_DATA = 1.7976931348623157e308
 FORMATS = ("dat", "datx")
-MAP_NAMES = tuple(f"{name}_[0-9]*.{suffix}" for name in ("map", "measure") for suffix in FORMATS)
+MAP_NAME = re.compile(rf"(map_\d{{6,}}|measure_\d+_\d+)\.({'|'.join(FORMATS)})")
 UNITS = ("Fringes", "NanoMeters")
 #: In which a file grows on a slow network share.
 PIECES = 8
@@ -167,7 +168,7 @@ def prune(folder: Path, limit: float) -> None:
     Only names that the bench and the node `interferometer` give to maps count: whatever else is there is not ours.
     """
     maps = []
-    for path in (path for pattern in MAP_NAMES for path in folder.glob(pattern)):
+    for path in (path for path in folder.iterdir() if MAP_NAME.fullmatch(path.name)):
         with contextlib.suppress(OSError):  # somebody else removed it
             maps.append((path.stat().st_mtime_ns, path.stat().st_size, path))
     total = 0

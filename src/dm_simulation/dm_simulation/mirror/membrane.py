@@ -81,7 +81,7 @@ class Membrane:
         self._gain = 1 + config.gain_spread * np.clip(rng.standard_normal(count), -3, 3)
         pattern = 1 + 0.5 * rng.standard_normal(count)
         self._drift = config.drift / np.abs(self._at_electrodes @ pattern).max() * pattern
-        self._began = time
+        self._began = self._time = time
         self.apply(np.zeros(count), time)
 
     def _modes(self, x: Array, y: Array) -> Array:
@@ -110,7 +110,8 @@ class Membrane:
         return -self._modes(x, y) @ self._compliance
 
     def advance(self, time: float) -> None:
-        """Let the zero drift until `time`."""
+        """Let the zero drift until `time`. A clock that jumps back only moves the origin of time."""
+        self._began += min(time - self._time, 0.0)
         self._time = time
 
     def apply(self, volts: Array, time: float) -> None:

@@ -91,6 +91,11 @@ class PiezoActuators:
         def spread(share: float) -> Array:
             return 1 + share * np.clip(rng.standard_normal(count), -3, 3)
 
+        if config.creep_fastest > config.creep_slowest:
+            raise ValueError(
+                f"piezo.creep_fastest = {config.creep_fastest:g} s: must not exceed piezo.creep_slowest, "
+                f"{config.creep_slowest:g} s"
+            )
         self.config = config
         self.gain = spread(config.gain_spread)
         opening = config.hysteresis * spread(config.hysteresis_spread)
@@ -109,19 +114,25 @@ class PiezoActuators:
         self._position = self._hysteresis.move(self.signals)
         self._crept = np.repeat(self._position[:, None], len(self._creep_times), axis=1)
         self._lagged = np.repeat((self._position - self.signals)[:, None], len(LAG_TIMES_S), axis=1)
-        self._time = time
+        self._time = self._began = time
 
     def _with_crosstalk(self, signals: Array) -> Array:
         return signals + self._crosstalk * np.roll(signals, -1)
 
     @property
+    def _age(self) -> float:
+        """s since the start: figures follow from the seed, whatever the time of day."""
+        return self._time - self._began
+
+    @property
     def temperature(self) -> float:
         """degC at the time last given."""
-        return float(ROOM + self.config.swing * np.sin(2.0 * np.pi * self._time / DAY_S + self._noon))
+        return float(ROOM + self.config.swing * np.sin(2.0 * np.pi * self._age / DAY_S + self._noon))
 
     def advance(self, time: float) -> None:
         """Let creep go on until `time`. A clock that jumps back only moves the origin of time."""
         elapsed = time - self._time
+        self._began += min(elapsed, 0.0)
         self._time = time
         if elapsed > 0:
             # Exact for a constant position, hence independent of how the time is cut into steps.
@@ -144,7 +155,7 @@ class PiezoActuators:
         lag = (position - self.signals)[:, None] - self._lagged
         moved = position + creep + config.rate_dependence / LAG_PER_DECADE * lag.sum(axis=1)
         moved = moved - config.stiffening * moved * np.abs(moved)
-        turns = np.sin(2 * np.pi * self._time / DRIFT_PERIODS_S + self._drift_phase)
+        turns = np.sin(2 * np.pi * self._age / DRIFT_PERIODS_S + self._drift_phase)
         warmer = self.temperature - ROOM
         gain = self.gain * (1.0 + config.warm_gain * warmer)
         return np.asarray(config.stroke / 2 * gain * moved + (self._drift * turns).sum(axis=1) + self._warm * warmer)

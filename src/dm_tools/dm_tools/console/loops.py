@@ -8,6 +8,7 @@ import numpy as np
 
 from dm_common.hysteresis.law_shape import closed_cycle, opening
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_tools.console.view_models import moved
 
 #: Points of each branch of a loop.
 STEPS = 41
@@ -49,7 +50,11 @@ def modelled_loop(law: HysteresisModel, actuator: int, low: float, high: float) 
 
 
 def way(start: float, amplitude: float, low: float, high: float) -> list[float]:
-    """Signals of a measured loop around `start`, which it ends at, inside `low` .. `high`."""
+    """Signals of a measured loop around `start`, which it ends at, inside `low` .. `high`.
+
+    Raises ValueError when the amplitude leads out of the range either way.
+    """
+    moved(start, amplitude, low, high)
     return [min(max(start + amplitude * share, low), high) for share in WAY]
 
 

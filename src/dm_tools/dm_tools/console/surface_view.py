@@ -101,7 +101,7 @@ class SurfaceView:
             self.predicted_then, self.predicted_zernike = self._model.surface(then), self._model.coefficients(then)
             self.difference = difference(self.measured, self.predicted_then)
         except ValueError as error:
-            self.difference = f"Not comparable: {error}."
+            self.difference, self.predicted_zernike = f"Not comparable: {error}.", None
         if self.predicted_then is not None and isinstance(self.predicted, Surface):
             moved = not self._now.near(self._then._replace(doubt=self.doubt), SMALL_MOVE)
             self.when = MOVED if moved else "The map is of the present shape."

@@ -207,14 +207,21 @@ def prediction_text(state: Any) -> str:
 def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: float, high: float) -> list[float]:
     """`base` (N,) with one actuator (1-based) moved by `amplitude`, or the other way where the range ends.
 
-    Raises ValueError when there is no such actuator.
+    Raises ValueError when there is no such actuator, or the amplitude leads out of the range either way.
     """
     if not 1 <= actuator <= len(base):
         raise ValueError(f"actuator = {actuator}: must be 1 to {len(base)}")
     signals = [float(value) for value in base]
-    up = signals[actuator - 1] + amplitude
-    signals[actuator - 1] = up if low <= up <= high else min(max(signals[actuator - 1] - amplitude, low), high)
+    signals[actuator - 1] = moved(signals[actuator - 1], amplitude, low, high)
     return signals
+
+
+def moved(signal: float, amplitude: float, low: float, high: float) -> float:
+    """`signal` moved by `amplitude`, or the other way where the range ends. Raises ValueError when both lead out."""
+    for there in (signal + amplitude, signal - amplitude):
+        if low <= there <= high:
+            return there
+    raise ValueError(f"amplitude = {amplitude:g}: from {signal:+.3f} both ways leave the range {low:+g} to {high:+g}")
 
 
 def decimal(text: str | None) -> float | None:

@@ -10,6 +10,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Topic
 from dm_tools.recording.interfaces import message_class
+from dm_tools.recording.recorder import COMMON
 
 #: Topics that would move a real mirror; published only when asked for.
 COMMANDS = ("actuator_command", "focus_request")
@@ -22,18 +23,28 @@ DEPTH = 10
 DISCOVERY_S = 1.0
 
 
-def replayed(topics: Sequence[str], names: Sequence[str] = (), commands: bool = False) -> list[str]:
+def replayed(
+    topics: Sequence[str], names: Sequence[str] = (), commands: bool = False, namespace: str = ""
+) -> list[str]:
     """Which of `topics` are published: `names`, or all but commands, hidden and housekeeping ones.
 
-    Raises ValueError for a name that is not in the recording, or of a command that must not be published.
+    Args:
+        namespace: only topics in it, and those that all mirrors share; "" = all.
+
+    Raises:
+        ValueError: a name or namespace that is not in the recording, or a command that must not be published.
     """
-    wanted = [name if name.startswith("/") else f"/{name}" for name in names]
+    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
+    if namespace and not any(name.startswith(prefix) for name in topics):
+        raise ValueError(f"namespace {namespace}: no topic of the recording is in it: {', '.join(sorted(topics))}")
+    wanted = [name if name.startswith("/") else prefix + name for name in names]
     for name in wanted:
         if name not in topics:
             raise ValueError(f"topic {name}: not in the recording, which has {', '.join(sorted(topics))}")
         if not commands and name.rsplit("/", 1)[-1] in COMMANDS:
             raise ValueError(f"topic {name}: a command, which is published with --commands only")
-    chosen = wanted or [name for name in topics if "/_" not in name and name not in HOUSEKEEPING]
+    own = [name for name in topics if name.startswith(prefix) or name in COMMON]
+    chosen = wanted or [name for name in own if "/_" not in name and name not in HOUSEKEEPING]
     return [name for name in chosen if commands or name.rsplit("/", 1)[-1] not in COMMANDS]
 
 

@@ -90,6 +90,11 @@ class Recorder:
         """Messages written of each topic so far."""
         return self._bag.counts
 
+    @property
+    def unseen(self) -> list[str]:
+        """Topics that were to be recorded and that nobody has published so far."""
+        return sorted(self._wanted - self.counts.keys() - self.refused.keys())
+
     def check(self) -> None:
         """Raise OSError when the recording can no longer be written (disk full, ...)."""
         if self._failure is not None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_tools.output import JsonOption, console, nanometres, next_step, write_json
+from dm_tools.parameter_changes import keep_before
 
 #: Columns of tables that hold no numbers.
 _TEXTS = ("file", "reference", "part")
@@ -80,12 +81,16 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     from dm_common.atomic_write import write_whole
 
     rows = _table(table, "file", "reference", "part", "degrees")
-    surfaces = [read(table.parent / row[0]) for row in rows]
+    sources = [table.parent / row[0] for row in rows]
+    if target.resolve() in [source.resolve() for source in (table, *sources)]:
+        raise ValueError(f"--write {target}: is read for this; give another file")
+    surfaces = [read(source) for source in sources]
     tests = [
         FlatTest(surface.sag, reference, part, math.radians(float(degrees)))
         for surface, (_, reference, part, degrees) in zip(surfaces, rows, strict=True)
     ]
     found = reference_from_flats(tests)
+    keep_before(target)
     write_whole(target, fits_bytes(replace(surfaces[0], sag=found.sag), "dm instrument flats"))
     console.print(
         f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "

@@ -54,9 +54,13 @@ def record(
         console.print(f"{count:8d}  {name}")
     for name, reason in recorder.refused.items():
         console.print(f"[yellow]not recorded[/] {name}: {reason}")
+    for name in recorder.unseen:
+        console.print(f"[yellow]not recorded[/] {name}: nobody published it")
     console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
     if not any(count for name, count in counts.items() if name != PARAMETER_EVENTS):
         shutil.rmtree(folder)
+        if names and counts.get(PARAMETER_EVENTS):  # nodes of the suite have answered
+            raise RuntimeError("nothing was recorded: --topics names nothing that they publish")
         raise NotRunningError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
     seconds = time.monotonic() - started
     write_json(json, {"folder": str(folder), "messages": counts, "refused": recorder.refused, "seconds": seconds})

@@ -38,6 +38,8 @@ def replay(
     for name in bag.unfinished:
         console.print(f"[yellow]remark[/] {name} was not finished: what is whole in it is read")
     if recalibrate:
+        if rate != 1.0 or topics or commands:
+            raise typer.BadParameter("--rate, --topics and --commands are for publishing, not for --recalibrate")
         figures = _again(bag, run, namespace, store, config)
         write_json(json, figures)
         if figures["identical"] is False:
@@ -45,7 +47,8 @@ def replay(
         return
     if run or store or config:
         raise typer.BadParameter("--run, --store and --config are for --recalibrate")
-    names = replayed(list(bag.topics), [name.strip() for name in topics.split(",") if name.strip()], commands)
+    wanted = [name.strip() for name in topics.split(",") if name.strip()]
+    names = replayed(list(bag.topics), wanted, commands, namespace)
     console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
     with progress_bar() as bar:
         task = bar.add_task("replay, s", total=round(bag.duration_s))

@@ -26,6 +26,7 @@ class ActuatorCards:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._cells: list[Cell] = []
+        self._followed = session.chosen
         self._loop: tuple[Any, ...] = ()
         with ui.element("div").classes("pair"):
             with card("Command map"):
@@ -64,11 +65,15 @@ class ActuatorCards:
             self._poke()
 
     def _typed(self) -> None:
-        if self._number.value is not None and 1 <= self._number.value <= max(len(self._cells), 1):
-            self._session.chosen = int(self._number.value)
+        if (value := self._number.value) in self._numbers:
+            self._session.chosen = self._followed = int(value)
+
+    @property
+    def _numbers(self) -> range:
+        return range(1, max(len(self._cells), 1) + 1)
 
     def _choose(self, number: int) -> None:
-        self._session.chosen = number
+        self._session.chosen = self._followed = number
         self._number.set_value(number)
 
     def _step(self, direction: float) -> None:
@@ -81,6 +86,14 @@ class ActuatorCards:
 
     # --- moving ---
 
+    def _typed_number(self, title: str) -> int | None:
+        """The number in the field, which need not be what is shown; None = of no actuator, and a failure says so."""
+        if (value := self._number.value) in self._numbers:
+            return int(value)
+        shown = "" if value is None else f" = {value:g}"
+        self._session.fail(title, f"number{shown}: must be a whole number, 1 to {self._numbers[-1]}")
+        return None
+
     def _swing(self) -> float:
         """The amplitude that was typed. Raises ValueError when there is none."""
         if (amplitude := self._amplitude.number) is None:
@@ -88,7 +101,9 @@ class ActuatorCards:
         return amplitude
 
     def _poke(self) -> None:
-        session, number, snapshot = self._session, self._session.chosen, self._session.snapshot()
+        session, snapshot = self._session, self._session.snapshot()
+        if (number := self._typed_number("Poke")) is None:
+            return
         reason = reason_against("move", snapshot, session.running)
         if reason:
             session.fail(f"Poke {number}", reason)
@@ -100,7 +115,9 @@ class ActuatorCards:
         self._session.begin("Release", operations.release)
 
     def _start_loop(self) -> None:
-        session, number = self._session, self._session.chosen
+        session = self._session
+        if (number := self._typed_number("Loop")) is None:
+            return
         title = f"Loop of actuator {number}"
         session.begin(title, lambda _session: operations.measure_loop(session, number, self._swing()), cancel="")
 
@@ -118,6 +135,8 @@ class ActuatorCards:
             return
         self._cells = cells(mirror, snapshot.actuator_state, snapshot.calibration)
         session.chosen = min(session.chosen, len(self._cells))
+        if session.chosen != self._followed:  # on another page
+            self._choose(session.chosen)
         radius = 0.5e3 * mirror.working_aperture_diameter
         self._picture.show(command_map(self._cells, session.chosen, radius, mirror.signal_min, mirror.signal_max))
         cell, state = self._cells[session.chosen - 1], snapshot.actuator_state
@@ -132,6 +151,7 @@ class ActuatorCards:
         if calibration is None or not law.has_history:
             fault = session.ros.observer.fault if calibration is not None else ""
             self._loop_text.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
+            self._loop = ()
             self._loop_picture.show(None, "No hysteresis was identified: the plan “Hysteresis” of a calibration does.")
             return
         settled = session.ros.observer.now(snapshot.bench_time)
@@ -139,7 +159,7 @@ class ActuatorCards:
         if settled.effective is not None and signal is not None:
             stands = (signal, round(float(settled.effective[session.chosen - 1]), 4))
         measured = session.loops.get((calibration.id, session.chosen))
-        key = (session.chosen, calibration.id, stands, id(measured))
+        key = (session.chosen, calibration.id, stands, settled.doubt, id(measured))
         if key == self._loop:
             return
         self._loop = key

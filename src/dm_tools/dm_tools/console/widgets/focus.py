@@ -28,6 +28,7 @@ class FocusCard:
         self._range: tuple[float, float] | None = None
         self._asked = self._asking = self._typing = False
         self._wish: tuple[object, ...] = ()  # and what else a prediction depends on
+        self._predicted: tuple[object, ...] = ()  # the wish alone
         with card("Focus"):
             self._text = Line("text figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
@@ -77,10 +78,13 @@ class FocusCard:
         value = self._number.number
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
         wish = (value, self._conic.number, self._mode.value, *self._prediction_basis(snapshot))
+        if wish[:3] != self._predicted:
+            self._prediction.show("")
         if wish != self._wish:
             self._wish, self._asked = wish, False
         elif not (reason or self._asked or self._asking):  # it has stood still since the last time
             self._asked = self._asking = True
+            self._predicted = wish[:3]
             background_tasks.create(self._predict())
 
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
