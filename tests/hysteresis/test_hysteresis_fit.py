@@ -81,6 +81,9 @@ def test_commands_without_a_map_stay_in_the_history() -> None:
 def test_a_range_that_is_not_symmetric_is_as_good() -> None:
     """Mid range, where a degauss ends, is not at 0 then."""
     assert run(low=-0.5).rest == 0.25
+    unwired = run(low=-0.5).applied.copy()
+    unwired[:, :3] = -1.0  # as the driver reports them
+    assert replace(run(low=-0.5), applied=unwired).rest == 0.25
     assert fitted(-0.5).held_out_max_zernike < 1.5 * fitted().held_out_max_zernike
     assert not any("contradict" in remark for remark in fitted(-0.5).remarks)
     assert fitted(-0.5).unknown_sigma < 0.9 * fitted().unknown_sigma  # loops are smaller

@@ -278,6 +278,7 @@ def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
         told = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
         wait_until(told, 60)
         wait_until(lambda: not books[-1].recipes, 60, "recipes of the mirror as it was to be withdrawn")
+        assert books[-1].degauss_steps == 100, "there are some"
     assert quality == Capabilities.CALIBRATED
     wait_until(lambda: suite.calibration.quality == Capabilities.APPROXIMATE, 60)
     assert suite.calibration.known_limitations[-1].startswith("The last 3 maps disagree with this calibration")

@@ -3,6 +3,7 @@
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +133,9 @@ class CalibrationNode(ManagedNode):
         self._listener.begin(calibration)
         self._listener.amend(message)
         # First, so that nobody takes the calibration for one without.
-        book = calibration.recipes if calibration and not self._listener.recipes_in_doubt else NO_RECIPES
+        book = calibration.recipes if calibration else NO_RECIPES
+        if self._listener.recipes_in_doubt:
+            book = replace(book, recipes=())
         self._recipes.publish(recipe_book_message(book, message.id))
         self._publisher.publish(message)
 

@@ -64,7 +64,7 @@ class RecipeBook:
 
     Attributes:
         recipes: by rising conic constant, added terms, curvature.
-        degauss_steps: half-swings of the degauss that they begin with.
+        degauss_steps: half-swings of the degauss that they begin with; without recipes, of those that are withheld.
         interpolation_error: m, by how much the bound halfway between neighbours exceeds what was re-measured, when the
             last were built.
         stamp_ns: when the last was built.
@@ -88,7 +88,7 @@ class RecipeBook:
 
     def check_condition(self, degauss_steps: int) -> None:
         """Raise RecipeError when recipes that begin with so many half-swings cannot join these."""
-        if self.recipes and degauss_steps != self.degauss_steps:
+        if self.degauss_steps and degauss_steps != self.degauss_steps:
             raise RecipeError(
                 f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}: "
                 "must be the same (recipes.degauss_steps), or calibrate anew"

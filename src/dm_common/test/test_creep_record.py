@@ -176,6 +176,14 @@ def test_a_small_jump_of_the_clock_is_in_doubt_for_as_long_as_itself() -> None:
     assert observer.state.crept_sigma == pytest.approx(sigma)
 
 
+def test_creep_goes_on_after_a_clock_that_ran_ahead_is_set_back() -> None:
+    observer = held_for_a_day()
+    observer.observe(report(0.0, 0.5, turns=1, heard=DAY + 7200.0), doubtful=7200.0)
+    assert observer.state is not None and observer.state.time > DAY + 3600.0
+    observer.observe(report(DAY + 10.0, -0.5, turns=2, heard=DAY + 10.0))
+    assert observer.state.time == DAY + 10.0
+
+
 def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
     file = tmp_path / "mirror.creep.npz"
     assert read_record(file, 0.0) is None

@@ -105,8 +105,11 @@ class MapSet:
 
     @property
     def rest(self) -> float:
-        """Signal of mid range, where reference frames are taken and a degauss ends, to the step of the electronics."""
-        return round(float(self.applied[self.reference].mean()), 4) if self.reference.any() else 0.0
+        """Signal of mid range, where reference frames are taken and a degauss ends, to the step of the electronics.
+
+        Actuators without a channel stand elsewhere. 0 where there is no reference frame.
+        """
+        return round(float(np.median(self.applied[self.reference])), 4) if self.reference.any() else 0.0
 
     def moved_s(self) -> Floats:
         """(M,) s since the first map: when the mirror took each shape; right after the map before, or the degauss

@@ -117,7 +117,8 @@ class MapListener:
     @property
     def recipes_in_doubt(self) -> bool:
         """Whether the mirror goes on without some actuators, or maps disagree: recipes are of what it was."""
-        return (kept := self._updates.in_use) is not None and bool(kept.drift.given_up or kept.disagreement)
+        kept = self._updates.in_use
+        return kept is not None and bool(kept.drift.given_up or kept.drift.surprising or kept.disagreement)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""

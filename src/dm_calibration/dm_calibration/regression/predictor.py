@@ -101,4 +101,4 @@ def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) 
         commands = middle + rng.uniform(-1.0, 1.0, (COMMANDS, HISTORIES, 1)) * chosen
     else:  # no smooth shape is known: every actuator on its own
         commands = rng.uniform(low, high, (COMMANDS, HISTORIES, maps.actuators))
-    return np.concatenate((np.full_like(commands[:1], middle), commands))
+    return np.concatenate((np.full_like(commands[:1], maps.rest), commands))

@@ -69,7 +69,7 @@ class HysteresisTracker:
             state = self.law.advance(self.state, self.law.crept_at)
             crept = np.repeat(self.law.crept[:, None], len(self.law.creep_time), axis=1)
             self.state, self._set_off = replace(state, crept=crept, crept_sigma=0.0 * state.crept_sigma), None
-        if report.time < last.time:
+        if report.time < last.time or max(report.time, report.heard) < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)
         if report.turns < last.turns or report.degausses < last.degausses:

@@ -11,6 +11,7 @@ from typing import Any
 from dm_msgs.action import Converge
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import Limits
 from dm_common.messages import doubles
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import without_figures
@@ -42,7 +43,7 @@ class ConvergeRun:
             handle.publish_feedback(feedback)
 
         def body() -> tuple[int, str]:
-            return self._judge(self._loop(handle.request, report))
+            return self._judge(*self._loop(handle.request, report))
 
         asked = handle.request.request
         outcome, error_code, message = self._bench.run("converge", handle, feedback, asked, body)
@@ -50,18 +51,19 @@ class ConvergeRun:
             message = str(StoppedLoop(tuple(steps)))
         return outcome, _result(steps, error_code, message)
 
-    def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> LoopResult:
+    def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> tuple[LoopResult, Limits]:
         bench = self._bench
         options = self._options(goal)
         target = bench.target(goal.request)
         solver = self._solver(goal.method)
         bench.check_ready()
         try:
-            return converge(
+            found = converge(
                 solver, target, bench, options, creep=self._creep(), on_step=report, cancelled=bench.cancelled
             )
         except Refusal as error:
             raise Refusal(error.error_code, f"{error}; the mirror holds the last command") from error
+        return found, solver.limits
 
     def _creep(self) -> Creep | None:
         """By the law in use and what is known of the actuators; without a law of creep, by the configured rate."""
@@ -84,7 +86,7 @@ class ConvergeRun:
         mirror, weights = active.mirror, active.calibration.region_weights
         return make_solver(method, mirror.model, mirror.limits, weights if len(weights) else None, mirror)
 
-    def _judge(self, outcome: LoopResult) -> tuple[int, str]:
+    def _judge(self, outcome: LoopResult, limits: Limits) -> tuple[int, str]:
         best = outcome.best
         figures = (
             f"{best.max_zernike * 1e9:.2f} nm largest coefficient error, {best.rms * 1e9:.1f} nm rms sag after "
@@ -92,8 +94,7 @@ class ConvergeRun:
         )
         if outcome.converged:
             return ErrorCode.OK, figures
-        at_limit = self._bench.active_calibration().mirror.limits.at_limit(best.signals)
-        limited = "; actuators stand at their limits" if at_limit.any() else ""
+        limited = "; actuators stand at their limits" if limits.at_limit(best.signals).any() else ""
         restored = "; the best command was written again" if outcome.restored else ""
         return ErrorCode.NOT_CONVERGED, f"not within the tolerance: {figures}{limited}{restored}"
 

@@ -69,7 +69,7 @@ class ActiveCalibration:
     @cached_property
     def corrections(self) -> Corrections:
         """What the recipes say of other shapes. Raises RecipeError when there are none."""
-        return Corrections(self.recipes, self.planner)
+        return Corrections(self.recipes, self.planner, stamp_ns(self.calibration.checked) > self.recipes.stamp_ns)
 
     @property
     def conditioned_error(self) -> float:

@@ -75,9 +75,8 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
     """
     book, degauss = context.active.recipes, context.degauss
     if not book.recipes:
-        raise Refusal(
-            ErrorCode.NOT_SUPPORTED, "mode conditioned: this calibration holds no recipes; use auto or direct"
-        )
+        there = "the recipes are withheld: maps disagree" if book.degauss_steps else "this calibration holds no recipes"
+        raise Refusal(ErrorCode.NOT_SUPPORTED, f"mode conditioned: {there}; use auto or direct")
     if degauss.steps != book.degauss_steps:
         raise Refusal(
             ErrorCode.CALIBRATION_MISMATCH,

@@ -172,7 +172,8 @@ class Planner:
             if law.creep_rate:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
-                drift, drift_rms = self._creep_error.drift(law.move(at, signals, arrival), reached)
+                stands = aim if missed is None else aim - missed
+                drift, drift_rms = self._creep_error.drift(law.move(at, signals, arrival), stands)
                 plan = replace(plan, drift=drift, drift_rms=drift_rms)
             return self._bounded(plan, signals, known, creep, error)
 

@@ -87,6 +87,10 @@ def _alike(one: Floats, other: Floats) -> Floats:
 class Corrections:
     """The corrections that the recipes of `book` show on the mirror of `planner`.
 
+    Args:
+        learnt: maps have agreed with the calibration since the recipes were built: what it gives otherwise since then
+            moves them too. Without such maps they stand as they were measured, also where updates of before are lost.
+
     Raises:
         RecipeError: there are none.
         Refusal: one is of no shape, naming its field.
@@ -95,7 +99,7 @@ class Corrections:
         amplitude: m, bound of the largest coefficient that a correction makes where no recipe is near.
     """
 
-    def __init__(self, book: RecipeBook, planner: Planner) -> None:
+    def __init__(self, book: RecipeBook, planner: Planner, learnt: bool = False) -> None:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
@@ -105,9 +109,8 @@ class Corrections:
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
         now = [planner.mirror.command(shape)[0] for shape in shapes]
-        # A calibration follows the mirror, and what it learns moves recipes as it moves every shape.
         known = zip(recipes, now, strict=True)
-        then = np.array([recipe.by_model if recipe.by_model.size else own for recipe, own in known])
+        then = np.array([recipe.by_model if learnt and recipe.by_model.size else own for recipe, own in known])
         tilt = self._other_tilt(then)
         self._then, self._own = then + tilt, np.array(now) + tilt
         self._corrections = self._effective - self._then

@@ -36,7 +36,8 @@ class SerialTerminal:
     ) -> None:
         if framed.channels > len(unit.outputs):
             raise ValueError(
-                f"framed.channels = {framed.channels}: must not exceed electronics.channels, {unit.config.channels}"
+                f"framed.channels = {framed.channels}: must not exceed {len(unit.outputs)}, the outputs with "
+                f"electronics.channels = {unit.config.channels}"
             )
         self._unit = unit
         decoder = FramedDecoder(framed) if framed.channels else None

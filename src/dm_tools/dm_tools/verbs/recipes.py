@@ -111,6 +111,7 @@ def recipes(
             f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
         )
     if not book.recipes:
-        console.print(f"calibration {book.calibration_id or '(none)'} holds no recipes")
+        none = "withholds its recipes: maps disagree" if book.degauss_steps else "holds no recipes"
+        console.print(f"calibration {book.calibration_id or '(none)'} {none}")
     write_json(json, {"calibration": book.calibration_id, **_figures(book)})
     next_step("./dm focus CURVATURE: with a time budget the controller uses a recipe where it does better")
