@@ -255,6 +255,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
                     "effective: [37 x 0.0], signals: [37 x 3.0]",
                     f"max_zernike: -1.0, {_RECIPE}",
                     f"rms: .nan, {_RECIPE}",
+                    f"by_model: [36 x 0.0], {_RECIPE}",
                 )
             ),
             f"recipes: {{calibration_id: IN_USE, degauss_steps: 0, recipes: [{{{_RECIPE}}}]}}",

@@ -100,7 +100,7 @@ def test_a_senseless_sheet_is_refused(changes: dict[str, Any], words: str) -> No
 
 def test_more_words_than_outputs_are_refused(tmp_path: Path) -> None:
     ports = PortsConfig(OFF, OFF, OFF, str(tmp_path / "tty"), FramedConfig(**SHEET | {"channels": 41}))
-    with pytest.raises(ValueError, match=r"framed\.channels = 41: must not exceed electronics\.channels, 24"):
+    with pytest.raises(ValueError, match=r"framed\.channels = 41: must not exceed 40, the outputs"):
         ElectronicsServer(DriveUnit(DriveConfig(wiring=range(19), channels=24)), ports, lambda: None)
 
 

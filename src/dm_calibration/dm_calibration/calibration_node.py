@@ -221,9 +221,9 @@ class CalibrationNode(ManagedNode):
     def _on_store_recipes(self, request: Any, response: Any) -> Any:
         for recipe in request.recipes.recipes:
             requests.RECIPE.check(recipe)
-            one_each = reals([], sizes=(len(request.recipes.recipes[0].effective),))
-            one_each.check("effective", recipe.effective)
-            one_each.check("signals", recipe.signals)
+            count = len(request.recipes.recipes[0].effective)
+            for name, sizes in (("effective", (count,)), ("signals", (count,)), ("by_model", (0, count))):
+                reals([], sizes=sizes).check(name, getattr(recipe, name))
         book = recipe_book_from(request.recipes)
         calibration = self._manager.add_recipes(request.recipes.calibration_id, book)
         response.message = (

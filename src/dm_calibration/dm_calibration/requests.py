@@ -48,6 +48,7 @@ RECIPE = Fields(
         "zernike": reals([], sizes=(0, len(TERMS))),
         "effective": reals([]),
         "signals": reals([], -1.0, 1.0),
+        "by_model": reals([]),
         "max_zernike": real(0.0, 0.0, 1.0, "m"),
         "rms": real(0.0, 0.0, 1.0, "m"),
     }

@@ -21,12 +21,6 @@ def test_shares_of_the_points_make_up_the_area_of_each_disc(points: SamplePoints
         assert (share[squared > fraction + 0.15] == 0.0).all()
 
 
-def test_weights_that_are_no_shares_of_an_area_are_refused() -> None:
-    points = edge_clustered_points(100)
-    with pytest.raises(ValueError, match="must be positive shares of the area that sum to 1"):
-        disc_shares(SamplePoints(points.x, points.y, 2 * points.weight))
-
-
 def test_a_region_without_data_is_named() -> None:
     points = edge_clustered_points(500)
     sag = np.ones((2, 500))
