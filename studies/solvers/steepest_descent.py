@@ -38,6 +38,7 @@ class SteepestDescent(Solver):
 
     def solve(self, wanted: Shape) -> Command:
         """As in the base class, by iteration on the model."""
+        self._check(wanted)
         change = self._factors * (wanted - self.offset).coefficients[PISTON_TILT:]
         command = Command(self._start())
         overflow = 0.0

@@ -231,6 +231,17 @@ def test_the_plate_model_needs_positions(model: InfluenceModel) -> None:
         PlateProperties(thickness=0.0)
 
 
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_bad_shapes_and_signals_are_refused(name: str, model: InfluenceModel) -> None:
+    solver, wanted = solver_of(name, model), target_shape(FocusTarget(0.01), model)
+    with pytest.raises(ValueError, match=r"coefficients of shape \(5,\): must be 21 finite numbers"):
+        solver.solve(Shape(wanted.coefficients[:5], wanted.sag))
+    with pytest.raises(ValueError, match=r"sag of shape \(300,\): must be 300 finite numbers"):
+        solver.solve(Shape(wanted.coefficients, np.full_like(wanted.sag, np.nan)))
+    with pytest.raises(ValueError, match=r"signals of shape \(3,\): must be 37 finite numbers"):
+        solver.correct(np.zeros(3), wanted)
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_dead_mirror_is_refused(name: str, model: InfluenceModel) -> None:
     dead = replace(

@@ -90,6 +90,8 @@ def test_a_region_without_data_is_named() -> None:
         regions.rms_of_each([whole, whole[1:]])
     with pytest.raises(ValueError, match="no map given"):
         regions.rms_of_each([])
+    with pytest.raises(ValueError, match=r"must be \(maps, 500 sampling points\)"):
+        regional_rms(sag[:, 1:], points)
 
 
 def test_mean_and_variance_over_surfaces() -> None:

@@ -98,7 +98,17 @@ def test_equation_8() -> None:
 @pytest.mark.parametrize("epsilon", [0.0, -1e-18, np.nan, np.inf])
 def test_epsilon_must_be_above_0(epsilon: float) -> None:
     with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
+        region_weights(np.ones(10), epsilon)
+    with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
         FitOptions(epsilon=epsilon)
+    with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
+        weighting(rim_maps(), epsilon=epsilon)
+
+
+def test_variances_must_be_variances() -> None:
+    for wrong in ([-1.0, 1.0], [np.nan], []):
+        with pytest.raises(ValueError, match="must be one finite number"):
+            region_weights(wrong, 1.0)
 
 
 def test_points_get_the_weight_of_their_ring() -> None:
@@ -108,6 +118,10 @@ def test_points_get_the_weight_of_their_ring() -> None:
     assert (np.diff(found[np.argsort(radius, kind="stable")]) <= 1e-12).all()
     assert found.max() == 1.0 and found[radius.argmax()] == pytest.approx(0.1, abs=0.02)
     assert np.square(found) @ POINTS.weight == pytest.approx(np.square(FALLING).mean())
+    with pytest.raises(ValueError, match="must be 10 finite numbers above 0, one per region"):
+        point_weights(POINTS, FALLING[1:])
+    with pytest.raises(ValueError, match="above 0"):
+        point_weights(POINTS, FALLING - 0.1)
 
 
 def test_place_a_the_weighted_coefficients() -> None:
@@ -123,6 +137,12 @@ def test_place_a_the_weighted_coefficients() -> None:
     assert rough[0] @ uneven.T == pytest.approx(expected)
     errors = [regional_rms(rough - rough @ operator.T @ terms.T, POINTS)[0] for operator in (equal, uneven)]
     assert errors[1][0] < errors[0][0] and errors[1][-1] > errors[0][-1]
+    few = edge_clustered_points(20)
+    with pytest.raises(ValueError, match="20 sampling points for 21 coefficients"):
+        coefficient_operator(few, FALLING)
+    line = SamplePoints(np.linspace(-1, 1, 50), np.zeros(50), np.full(50, 1 / 50))
+    with pytest.raises(ValueError, match="do not tell the 21 terms apart"):
+        coefficient_operator(line, FALLING)
 
 
 def test_place_b_the_weighted_command() -> None:
@@ -202,6 +222,8 @@ def test_too_few_or_equal_surfaces_are_refused() -> None:
     repeated = replace(maps, step=np.arange(len(maps)) % 3)
     with pytest.raises(TooFewMapsError, match=r"3 sample surfaces: .* need at least 4"):
         weighting(repeated)
+    with pytest.raises(ValueError, match="folds = 1: must be at least 2"):
+        weighting(maps, folds=1)
     with pytest.raises(ValueError, match="use AZreg"):
         weighting(
             replace(

@@ -25,6 +25,7 @@ from dm_calibration.influence.regression import (
     make_design,
     regress,
 )
+from dm_calibration.influence.weights import check_epsilon
 from dm_common import Floats
 from dm_common.errors import unknown_name
 from dm_common.limits import Limits
@@ -70,8 +71,8 @@ class FitOptions:
     def __post_init__(self) -> None:
         if self.folds < 2:
             raise ValueError(f"folds = {self.folds}: must be at least 2")
-        if self.epsilon is not None and not 0.0 < self.epsilon < np.inf:
-            raise ValueError(f"epsilon = {self.epsilon:g} m^2: must be above 0 and finite")
+        if self.epsilon is not None:
+            check_epsilon(self.epsilon)
 
 
 @dataclass(frozen=True)

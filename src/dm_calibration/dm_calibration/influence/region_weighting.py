@@ -96,9 +96,11 @@ def choose_weighting(
     Raises:
         TooFewMapsError: fewer than four sample surfaces.
         EmptyRegionError: a sample surface has no data in some region.
-        ValueError: regional errors that are the same for all surfaces, so that no weights follow; maps with other than
-            21 terms.
+        ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2;
+            epsilon not above 0; maps with other than 21 terms.
     """
+    if folds < 2:
+        raise ValueError(f"folds = {folds}: must be at least 2")
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
     chosen = sample_surfaces(maps)

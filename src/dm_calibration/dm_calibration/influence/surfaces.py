@@ -99,8 +99,13 @@ def missing_on(name: str, mirror: Mirror) -> str:
 def signal_surface(name: str, mirror: Mirror) -> Surface:
     """A surface with prescribed signals (p01-p54), scaled about its mean when it breaks a limit of the mirror.
 
-    Table 1's -1 and +1 are the ends of the signal range. Not for one that is :func:`missing_on` the mirror.
+    Table 1's -1 and +1 are the ends of the signal range.
+
+    Raises:
+        ValueError: the mirror has no such actuator or ring, or the surface needs a model.
     """
+    if reason := missing_on(name, mirror):
+        raise ValueError(reason)
     table = np.full(mirror.actuators, -1.0)
     if name in _LEVELS:
         table[:] = _LEVELS[name]
@@ -108,8 +113,10 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
         table[_POKES[name]] = 1.0
     elif name in _RINGS:
         table[mirror.rings == _RINGS[name]] = 1.0
-    else:
+    elif name in _CENTRE:
         table[0] = _CENTRE[name]
+    else:
+        raise ValueError(f"{name} does not prescribe signals")
     middle, half = mirror.rest[0], mirror.limits.half_range
     signals, factor = mirror.limits.scaled(middle + half * table)
     remark = "" if factor == 1.0 else f"{name}: scaled about its mean to {factor:.0%} to keep the mirror's limits"
@@ -158,7 +165,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
     if name in SPHERES:
         nominal = conic_coefficients(1.0 / SPHERES[name], 0.0, mirror.working_radius)
         wanted = f"sphere of radius {SPHERES[name]:+g} m"
-    else:
+    elif name in _ZERNIKES:
         index = ZERNIKE_INDEX[_ZERNIKES[name]]
         unit = np.zeros(len(TERMS))
         unit[index] = 1.0
@@ -174,6 +181,8 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
             return Surface(name, signals, 0.0 * unit, target=target)
         nominal = amplitude * unit
         wanted = f"{ZERNIKE_NAMES[_ZERNIKES[name]]} of {amplitude * 1e9:.0f} nm"
+    else:
+        raise ValueError(f"{name} prescribes signals, not a shape")
     signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
     signals, factor = mirror.limits.scaled(signals)
     described = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"

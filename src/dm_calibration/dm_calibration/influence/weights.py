@@ -29,6 +29,9 @@ from dm_common.optics.sample_regions import point_weights
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import TERMS, basis
 
+#: Smallest singular value, relative to the largest, at which a least-squares problem still counts as determined.
+RANK_TOLERANCE = 1e-7
+
 
 def region_weights(variance: ArrayLike, epsilon: float) -> Floats:
     """Eq. (8): w_i = (1 + (r_i / epsilon)^2)^(-1/2).
@@ -39,8 +42,23 @@ def region_weights(variance: ArrayLike, epsilon: float) -> Floats:
 
     Returns:
         (R,) above 0, at most 1.
+
+    Raises:
+        ValueError: epsilon not above 0, or a variance negative or not finite.
     """
-    return np.asarray(1.0 / np.hypot(1.0, np.asarray(variance) / epsilon))
+    r = np.asarray(variance, dtype=float)
+    check_epsilon(epsilon)
+    if r.ndim != 1 or not r.size or not (np.isfinite(r) & (r >= 0.0)).all():
+        raise ValueError(f"variance = {r.tolist()}: must be one finite number of m^2, 0 or more, per region")
+    return np.asarray(1.0 / np.hypot(1.0, r / epsilon))
+
+
+def check_epsilon(epsilon: float) -> None:
+    """Raise ValueError unless `epsilon` (m^2) can be the prior parameter of Eq. (8)."""
+    if not (np.isfinite(epsilon) and epsilon > 0.0):
+        raise ValueError(
+            f"epsilon = {epsilon:g} m^2: must be above 0 and finite; the median of the variances is a start"
+        )
 
 
 def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Floats, points: SamplePoints) -> Floats:
@@ -73,7 +91,16 @@ def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
 
     Returns:
         (21, P): coefficients (M, 21) = sag (M, P) @ operator.T, in the unit of the sag.
+
+    Raises:
+        ValueError: fewer points than terms, or points that do not tell the terms apart.
     """
+    if len(points) < len(TERMS):
+        raise ValueError(
+            f"{len(points)} sampling points for {len(TERMS)} coefficients: at least {len(TERMS)} are needed"
+        )
     row = np.sqrt(points.weight) * point_weights(points, weights)
     weighted = row[:, np.newaxis] * basis(points.x, points.y)
+    if np.linalg.cond(weighted) > 1.0 / RANK_TOLERANCE:
+        raise ValueError(f"the {len(points)} sampling points do not tell the {len(TERMS)} terms apart: spread them out")
     return np.asarray(np.linalg.pinv(weighted) * row)

@@ -18,12 +18,21 @@ DPI = 130
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; the first column is a name, the others are numbers, set to the right, unless `textual`."""
+    """Rows under a header; the first column is a name, the others are numbers, set to the right, unless `textual`.
+
+    Raises:
+        ValueError: a row of another length than the header.
+    """
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     textual: bool = False
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(f"{self.caption}: a row of {len(row)} cells under {len(self.header)} headings")
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,9 +41,19 @@ def check_regions(rms: Floats, area_fractions: Sequence[float] | Floats, labels:
 
 
 def disc_shares(points: SamplePoints) -> Floats:
-    """(P, R): part of each point's own area, 0..1, that lies inside each concentric disc."""
+    """(P, R): part of each point's own area, 0..1, that lies inside each concentric disc.
+
+    Raises:
+        ValueError: weights that are not positive or do not sum to 1.
+    """
+    weight = points.weight
+    if not (weight > 0).all() or abs(weight.sum() - 1.0) > 1e-6:
+        raise ValueError(
+            f"weights of the sampling points: from {weight.min():g}, sum {weight.sum():g}; "
+            "must be positive shares of the area that sum to 1"
+        )
     _, ring = np.unique(np.round(points.x**2 + points.y**2, _RADIUS_DECIMALS), return_inverse=True)
-    area = np.bincount(ring.ravel(), points.weight)
+    area = np.bincount(ring.ravel(), weight)
     outer = np.cumsum(area)
     inner = outer - area
     # The last ring ends at 1 but for rounding, and the whole aperture must hold it whole.
@@ -66,7 +76,10 @@ def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) 
 
     Raises:
         EmptyRegionError: a region of some map has no sample.
+        ValueError: shapes that disagree.
     """
+    if sag.ndim != 2 or sag.shape[1] != len(points):
+        raise ValueError(f"sag has the shape {sag.shape}: must be (maps, {len(points)} sampling points)")
     shares = points.weight[:, np.newaxis] * disc_shares(points)
     seen = np.isfinite(sag)
     energy = np.where(seen, np.square(sag), 0.0) @ shares
@@ -85,9 +98,17 @@ def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
 
     Args:
         weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
+
+    Raises:
+        ValueError: weights not above 0, or not one per region.
     """
+    w = np.asarray(weights, dtype=float)
+    if w.shape != (len(AREA_FRACTIONS),) or not (np.isfinite(w) & (w > 0.0)).all():
+        raise ValueError(
+            f"weights = {w.tolist()}: must be {len(AREA_FRACTIONS)} finite numbers above 0, one per region"
+        )
     ring_shares = np.diff(disc_shares(points), axis=1, prepend=0.0)
-    return np.asarray(np.sqrt(ring_shares @ np.square(weights)))
+    return np.asarray(np.sqrt(ring_shares @ np.square(w)))
 
 
 def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:

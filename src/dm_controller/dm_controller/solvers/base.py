@@ -84,7 +84,12 @@ class Solver(ABC):
         self.offset = model.offset
 
     def solve(self, wanted: Shape) -> Command:
-        """Signals for a surface, without measuring (open loop)."""
+        """Signals for a surface, without measuring (open loop).
+
+        Raises:
+            ValueError: a shape of other size than the model's, or not finite.
+        """
+        self._check(wanted)
         return self.limited(self._signals(self._start(), wanted - self.offset))
 
     def command(self, target: FocusTarget) -> Command:
@@ -92,7 +97,15 @@ class Solver(ABC):
         return self.solve(target_shape(target, self.model))
 
     def correct(self, signals: Floats, error: Shape) -> Command:
-        """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step)."""
+        """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step).
+
+        Raises:
+            ValueError: signals or a shape of other size than the model's, or not finite.
+        """
+        self._check(error)
+        count = self.model.influence_zernike.shape[1]
+        if signals.shape != (count,) or not np.isfinite(signals).all():
+            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
         return self.limited(self._corrected(signals, error))
 
     def _corrected(self, signals: Floats, error: Shape) -> Floats:
@@ -106,6 +119,16 @@ class Solver(ABC):
     def _start(self) -> Floats:
         """Signals at which the model's offset is the surface."""
         return np.zeros(self.model.influence_zernike.shape[1])
+
+    def _check(self, shape: Shape) -> None:
+        for name, value, size in (
+            ("coefficients", shape.coefficients, self.model.zernike_offset.size),
+            ("sag", shape.sag, self.model.sag_offset.size),
+        ):
+            if value.shape != (size,) or not np.isfinite(value).all():
+                raise ValueError(
+                    f"{name} of shape {value.shape}: must be {size} finite numbers, as many as the calibration has"
+                )
 
     def limited(self, signals: Floats) -> Command:
         """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""
