@@ -239,8 +239,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "store_recipes": (
         srv.StoreRecipes,
         (
-            "recipes: {calibration_id: IN_USE}",
-            "recipes: {calibration_id: LONG}",
+            *(f"recipes: {{calibration_id: {whose}}}" for whose in ("IN_USE", "LONG")),
             f"recipes: {{calibration_id: nonsense, degauss_steps: 100, recipes: [{{{_RECIPE}}}]}}",
             *(
                 f"recipes: {{calibration_id: IN_USE, degauss_steps: 100, recipes: [{{{recipe}}}]}}"

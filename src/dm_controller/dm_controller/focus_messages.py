@@ -39,7 +39,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
     state.header.stamp = time_message(order.began.ns)
     if move is not None and active is not None:
         plan = move.plan
-        drift, drift_rms = (0.0, 0.0) if order.creep_held else (plan.drift, plan.drift_rms)
+        drift, drift_rms = (0.0, 0.0) if order.creep_held else move.drift
         largest = plan.max_zernike_upper + drift
         state.calibration_id = active.calibration.id
         state.signals = doubles(plan.signals)
@@ -47,7 +47,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
         state.predicted_rms_lower, state.predicted_rms_upper = plan.rms_lower, plan.rms_upper + drift_rms
         if share is not None:
             state.predicted_rms_lower, upper = share.interval(request.curvature, plan.rms)
-            state.predicted_rms_upper = max(plan.rms_upper, upper)
+            state.predicted_rms_upper = max(state.predicted_rms_upper, upper)
         state.predicted_max_zernike = plan.max_zernike
         state.predicted_max_zernike_upper = largest
         state.predicted_duration = move.duration
@@ -113,7 +113,7 @@ def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -
         after, before = (used.mirror.predict(move.target, move.effective).max_zernike for used in (active, was))
         worse = planner.error_bound(True) ** 2 - was.planner.error_bound(True) ** 2
         largest, spread = max(0.0, largest + after - before), math.hypot(spread, math.sqrt(max(0.0, worse)))
-    drift = 0.0 if order.creep_held else plan.drift
+    drift = 0.0 if order.creep_held else move.drift[0]
     if drift and observer.state is not None and observer.law.same_as(was.planner.law):
         drift = planner.drift(observer.state, now.time, move.effective)
     # What was written again after a lost link is on another branch of the hysteresis than it was found for.

@@ -69,7 +69,7 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         law=law,
         zernike_sigma=sigma,
         held_out_max_zernike=largest_of(covariance),
-        unknown_sigma=unknown_history_sigma(found.fit.law, *_range(run)),
+        unknown_sigma=unknown_history_sigma(found.fit.law, *run.reach),
         maps=int(run.responses.usable.sum()),
         remarks=(*_remarks(found), *_left_out(maps, run)),
     )
@@ -158,12 +158,6 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     free, gains = basis_of(design[:, known]), solution[known][1:] / scatter
     unknown, left = without(fading[keep], free), without(values / scatter, free)
     return weights_of(unknown, left, gains, np.eye(fading.shape[1]), (1.0, 0.0))
-
-
-def _range(run: Run) -> tuple[float, float]:
-    """Of the signals of the actuators that moved."""
-    moved = run.signals[:, np.ptp(run.signals, axis=0) > 0.0]
-    return float(moved.min()), float(moved.max())
 
 
 def unknown_history_sigma(law: HysteresisModel, low: float, high: float) -> float:

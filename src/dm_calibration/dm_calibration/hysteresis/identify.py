@@ -111,7 +111,6 @@ def identify(
     fading: list[LawFit] = []  # common ones, those that cannot be inverted too
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
-    reach = float(run.signals.min()), float(run.signals.max())
 
     def size(residual: Floats) -> float:
         return float(np.sqrt(np.mean(np.square(residual[train] / scatter))))
@@ -122,7 +121,7 @@ def identify(
         whole = whole or problem.fit(train)
         if not whole.candidate.own and whole.candidate.slopes:
             fading.append(whole)
-        slope = law_shape.slope_min(whole.law, *reach)
+        slope = law_shape.slope_min(whole.law, *run.reach)
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return

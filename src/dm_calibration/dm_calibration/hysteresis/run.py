@@ -77,6 +77,12 @@ class Run:
         again = [] if self.degaussed is None else part.start + 1 + np.flatnonzero(self.degaussed[part][1:])
         return [slice(*bounds) for bounds in pairwise((part.start, *again, part.stop))]
 
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Lowest and highest signal of the actuators that moved; one without a channel stands elsewhere."""
+        moved = self.signals[:, np.ptp(self.signals, axis=0) > 0.0]
+        return float(moved.min()), float(moved.max())
+
     def follow(self, law: HysteresisModel) -> Floats:
         """(M, N) effective signals."""
         followed = []

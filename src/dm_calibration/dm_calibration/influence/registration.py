@@ -163,9 +163,8 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
     ]
     nearest = [np.abs(_seen(start, places)[:, None] - seen).min(axis=0) / step for start in starts]
     order = np.argsort([np.mean(np.minimum(distance, TOLERANCE) ** 2) for distance in nearest], kind="stable")
-    own = _Similarity(
-        1.0 + 0j, complex((seen - places[active]).mean()), False
-    )  # as configured: few bumps fit many turns
+    # Few bumps fit many turns: as configured is one of them.
+    own = _Similarity(1.0 + 0j, complex((seen - places[active]).mean()), False)
     matches = [_closest(seen, places, start, step) for start in (own, *(starts[index] for index in order[:TRIED]))]
     least = min(match.distance for match in matches)
     alike = [match for match in matches if match.distance < least + ALIKE]

@@ -13,6 +13,7 @@ map.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,11 @@ class Design:
     @property
     def unknowns(self) -> int:
         return int(self.matrix.shape[1])
+
+    @cached_property
+    def basis(self) -> Floats:
+        """(M, p) orthonormal columns that span the matrix."""
+        return np.asarray(np.linalg.qr(self.matrix)[0])
 
 
 @dataclass(frozen=True)
@@ -187,11 +193,10 @@ class SeenAlike(NamedTuple):
 
 def seen_alike(design: Design, seen: NDArray[np.bool_]) -> list[SeenAlike]:
     """All sampling points, sorted by which maps `seen` (M, P) have data there."""
-    projection = np.linalg.qr(design.matrix)[0]
     _, first, which = np.unique(np.packbits(seen, axis=0), axis=1, return_index=True, return_inverse=True)
     found = []
     for number, rows in enumerate(seen[:, first].T):
-        lost = projection[~rows]
+        lost = design.basis[~rows]
         value, vector = np.linalg.eigh(np.eye(len(lost)) - lost @ lost.T)
         inverse = (vector / value) @ vector.T if value.min(initial=1.0) > SEEN_MIN else None
         found.append(SeenAlike(np.flatnonzero(which.ravel() == number), lost, inverse))
@@ -214,7 +219,7 @@ def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     if gaps.any():
         modes = basis(maps.points.x, maps.points.y)
         model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
-        projection, seen = np.linalg.qr(design.matrix)[0], np.isfinite(sag)
+        projection, seen = design.basis, np.isfinite(sag)
         alike = seen_alike(design, seen)
         for _ in range(GAP_ROUNDS):
             before = filled[gaps]

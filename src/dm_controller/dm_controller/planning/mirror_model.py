@@ -107,8 +107,6 @@ class Plan:
     max_zernike: float
     max_zernike_upper: float
     saturated: NDArray[np.bool_]
-    drift: float = 0.0  # m, what creep adds to the largest coefficient, and to the rms, where nothing corrects it
-    drift_rms: float = 0.0
     most: str = ""  # what most of the bound comes from, where that is much more than the calibration's own
 
 
@@ -245,10 +243,12 @@ class CalibratedMirror:
         model = self.model
         error = response(model, signals) - self.wanted(target)[0]
         rms = float(np.linalg.norm(self._reduce(error.sag, self._tilt_free)))
+        lower, upper = rms_bounds(rms, model.held_out_rms)
         return Plan(
-            signals,
-            rms,
-            *rms_bounds(rms, model.held_out_rms),
+            signals=signals,
+            rms=rms,
+            rms_lower=lower,
+            rms_upper=upper,
             max_zernike=error.max_zernike,
             max_zernike_upper=error.max_zernike + model.held_out_max_zernike,
             saturated=self.limits.at_limit(signals),

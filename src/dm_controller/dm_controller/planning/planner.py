@@ -71,6 +71,7 @@ class Move:
     known: bool
     duration: float
     _predict: Callable[[], Plan]
+    _drift: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
     mode: str = FocusRequest.MODE_DIRECT
     degauss: int | None = None
 
@@ -78,6 +79,11 @@ class Move:
     def plan(self) -> Plan:
         """Command and prediction, worked out when first asked for: a command need not wait for it."""
         return self._predict()
+
+    @cached_property
+    def drift(self) -> tuple[float, float]:
+        """m, what creep adds to the largest coefficient error and to the rms within 100 s where nothing corrects it."""
+        return self._drift()
 
 
 class Planner:
@@ -172,12 +178,15 @@ class Planner:
             if law.creep_rate:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
-                stands = aim if missed is None else aim - missed
-                drift, drift_rms = self._creep_error.drift(law.move(at, signals, arrival), stands)
-                plan = replace(plan, drift=drift, drift_rms=drift_rms)
             return self._bounded(plan, signals, known, creep, error)
 
-        return Move(target, signals, reached, largest, known, travel + ahead, predict)
+        def drift() -> tuple[float, float]:
+            if not law.creep_rate:
+                return 0.0, 0.0
+            stands = law.move(law.advance(begun, arrival), signals, arrival)
+            return self._creep_error.drift(stands, aim if missed is None else aim - missed)
+
+        return Move(target, signals, reached, largest, known, travel + ahead, predict, drift)
 
     def _inverted(
         self,
