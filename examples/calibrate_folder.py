@@ -24,4 +24,5 @@ calibration = calibrate(folder, commands, mirror=mirror)
 print(f"{len(calibration.maps)} maps, {calibration.fit.held_out_rms * 1e9:.2f} nm rms on maps held out")
 print("influence function, m per unit signal:", calibration.fit.influence_zernike.shape)
 print(*calibration.limitations, sep="\n")
-print("stored as", CalibrationStore(folder).save(calibration))  # copied to calibration_folder, the node loads it
+# Not beside the maps: the file ends in .h5 as some of these do. Copied to calibration_folder, the node loads it.
+print("stored as", CalibrationStore(folder / "calibrations").save(calibration))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from dm_calibration.procedure.applied_history import SettledState
+from dm_calibration.procedure.applied_history import AppliedHistory, SettledState
 from dm_common.hysteresis.creep_record import CreepRecord, record_of
 from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.measurement import Measurement
 from dm_common.recipes import NO_RECIPES, RecipeBook
-from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
+from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError
@@ -21,13 +22,34 @@ from studies.comparison.simulated_bench import SimulatedBench
 CORRECTION_GROWTH = 0.07
 
 
-def build_recipes(bench: SimulatedBench, planner: Planner, curvatures: Iterable[float]) -> tuple[RecipeBook, list[str]]:
-    """Recipes of these curvatures, built on the bench as it stands, and why others of them could not be built."""
-    tracker = HysteresisTracker(planner.law)
+def build_recipes(
+    bench: SimulatedBench,
+    planner: Planner,
+    curvatures: Iterable[float],
+    on_map: Callable[[Measurement, SettledState], object] = lambda measured, settled: None,
+) -> tuple[RecipeBook, list[str]]:
+    """Recipes of these curvatures, built on the bench as it stands, and why others of them could not be built.
+
+    Args:
+        on_map: called with each map, and what stood at the mirror.
+    """
+    tracker, history = HysteresisTracker(planner.law), AppliedHistory()
+    history.follow(planner.law)
     for report in bench.reports:
         tracker.observe(report)
+        history.observe(report)
+    seen = len(bench.reports)
+
+    def on_step(_: BuildStep) -> None:
+        nonlocal seen
+        for report in bench.reports[seen:]:
+            history.observe(report)
+        seen = len(bench.reports)
+        assert bench.latest is not None
+        on_map(bench.latest, history.settled(bench.time, 0.0))
+
     options = BuildOptions(settle_time=bench.config.settle_time)
-    builder = RecipeBuilder(planner, bench, lambda: bench.time, options, state=tracker.state)
+    builder = RecipeBuilder(planner, bench, lambda: bench.time, options, state=tracker.state, on_step=on_step)
     refusals = []
     for curvature in curvatures:
         try:

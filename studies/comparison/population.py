@@ -118,33 +118,35 @@ def _restarted(
     return DrivenMirror(bench, active.planner, seen=seen, record=record)
 
 
-def _checked(
-    bench: SimulatedBench, calibration: Calibration, driven: DrivenMirror, targets: Sequence[FocusTarget]
-) -> ActiveCalibration:
-    """The calibration in use after a map of each of these shapes."""
-    with tempfile.TemporaryDirectory() as folder:
-        updates = RecalibrationManager(Path(folder), UpdateOptions)
-        updates.begin(calibration)
-        for target in targets:
-            driven.hold(driven.go(driven.plan(target)), bench.config.settle_time)
-            updates.take(bench.measure("check"), driven.settled())
-        message = calibration_message(calibration, None, "mirror", 1.0)
-        assert updates.in_use is not None
-        put_updates(message, updates.in_use, math.nan, [], updates.mirror_changed)
-    return active_of(bench, message)
+class _KeptTrue:
+    """A calibration that every map keeps true, as the node `calibration` does with those of checks and of recipes."""
+
+    def __init__(self, bench: SimulatedBench, calibration: Calibration, folder: str) -> None:
+        self._bench, self._calibration = bench, calibration
+        self._updates = RecalibrationManager(Path(folder), UpdateOptions)
+        self._updates.begin(calibration)
+        self.take = self._updates.take
+
+    def active(self) -> ActiveCalibration:
+        """As it is now."""
+        message = calibration_message(self._calibration, None, "mirror", 1.0)
+        if (kept := self._updates.in_use) is not None and kept.drift.revision:
+            put_updates(message, kept, math.nan, [], self._updates.mirror_changed)
+        return active_of(self._bench, message)
 
 
 def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lambda step: None) -> Outcome:
     """Draw, calibrate and judge one mirror; one that cannot be judged to the end has a failure and no figures."""
     mirror = draw_mirror(seed, options.pixels)
     try:
-        return _judged(mirror, options, progress)
+        with tempfile.TemporaryDirectory() as folder:
+            return _judged(mirror, options, folder, progress)
     except (Refusal, ValueError) as error:
         return Outcome(mirror, failure=str(error))
 
 
-def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress) -> Outcome:
-    """Calibrate and judge one mirror.
+def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progress: Progress) -> Outcome:
+    """Calibrate and judge one mirror; what its maps show later is kept in `folder`.
 
     Raises:
         Refusal, ValueError: it cannot be calibrated, or no request can be drawn, planned or carried out.
@@ -167,16 +169,20 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
         raise ValueError("no curvature is reachable: the figure takes the whole range")
     groups: dict[str, Requests] = {}
     book, unreachable = NO_RECIPES, list[str]()
+    kept = _KeptTrue(bench, calibration, folder)
     if options.recipes:
         progress(f"seed {seed}: recipes")
         curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
-        book, unreachable = build_recipes(bench, active.planner, curvatures)
+        book, unreachable = build_recipes(bench, active.planner, curvatures, kept.take)
+        active = kept.active()
     _age(bench, mirror, rng)
 
     progress(f"seed {seed}: any order")
     dwells = rng.permutation(np.resize(DWELLS, options.requests))
     other = bench.fork()
     driven = DrivenMirror(other, active.planner)
+    if options.recipes:
+        driven = driven.under(active.planner, active.calibration.creep_shown)
     groups[ANY_ORDER] = judge_requests(driven, active, surface, draw_targets(active, options.requests, rng), dwells)
     # From there a move that a power cut ends.
     progress(f"seed {seed}: power cut")
@@ -184,7 +190,7 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     short = np.resize(DWELLS[:4], FIRST_REQUESTS)
     record = driven.record()  # the last before the move
     other.power_cut(driven.plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
-    driven = _restarted(other, active, float(10.0 ** rng.uniform(0, 3.5)), record)
+    driven = _restarted(other, kept.active(), float(10.0 ** rng.uniform(0, 3.5)), record)
     groups[POWER_CUT] = judge_requests(driven, active, surface, first[1:], short)
 
     progress(f"seed {seed}: restart")
@@ -192,10 +198,13 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     driven = DrivenMirror(other, active.planner)
     driven.hold(driven.go(driven.plan(first[0])), HELD_S)
-    driven = _restarted(other, active, OFF_S, driven.record())
+    driven = _restarted(other, kept.active(), OFF_S, driven.record())
     groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
     progress(f"seed {seed}: check maps")
-    checked = _checked(other, calibration, driven, draw_targets(active, CHECK_MAPS, rng))
+    for target in draw_targets(active, CHECK_MAPS, rng):
+        driven.hold(driven.go(driven.plan(target)), other.config.settle_time)
+        kept.take(other.measure("check"), driven.settled())
+    checked = kept.active()
     first = draw_targets(checked, FIRST_REQUESTS, rng)
     driven = driven.under(checked.planner, checked.calibration.creep_shown)
     groups[CHECKED] = judge_requests(driven, checked, surface, first, short)

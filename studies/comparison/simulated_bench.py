@@ -54,6 +54,7 @@ class SimulatedBench:
         piezo: its actuators, which nothing but an experiment may touch.
         time: s since the start.
         maps: maps taken so far.
+        latest: the last of them; None = none yet.
         reports: what the driver would have reported after each move, from the first power-on.
     """
 
@@ -91,6 +92,7 @@ class SimulatedBench:
         self.slew_rate = self._limiter.limits.slew_rate
         self.time = self._moved = 0.0
         self.maps = 0
+        self.latest: Measurement | None = None
         self.reports: list[Applied] = []
         self._report()
         self.limits = Limits(-1.0, 1.0, pairs, config.neighbour_difference)
@@ -176,7 +178,8 @@ class SimulatedBench:
         """Take one map, fit and sample it as the interferometer node does a file."""
         self.time += self.config.exposure
         self.maps += 1
-        return self.measurement_of(self.take_map())
+        self.latest = self.measurement_of(self.take_map())
+        return self.latest
 
     # --- the map itself ---
 

@@ -27,6 +27,8 @@ from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
 from PIL import Image as PillowImage
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
@@ -443,10 +445,12 @@ def test_what_the_controller_refuses_is_left_out(scene: FilmedScene, observer: O
 
 def test_a_scene_without_texture_ends_without_a_focus(scene: FilmedScene, observer: Observer) -> None:
     scene.texture[:] = 100.0
+    unasked = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert "; the mirror stays where it is" in unasked.message, "nobody knows where it was"
     scene.request.publish(FocusRequest(curvature=0.004))
     wait_until(lambda: scene.states[-1].curvature == 0.004, what="the focus that was there before")
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
-    assert found.error_code == ErrorCode.NOT_CONVERGED
+    assert found.error_code == ErrorCode.NOT_CONVERGED and "; the mirror is back where it was" in found.message
     assert scene.requests[-1].curvature == 0.004, "back where it was"
 
 
@@ -569,6 +573,10 @@ def test_a_senseless_region_keeps_the_node_from_its_work_with_the_reason(start: 
     answer = observer.call(GetFocusRange, "get_focus_range")
     assert answer.error_code == ErrorCode.NODE_INACTIVE
     assert "region = [0.5, 0.0, 0.9, 1.0]" in answer.message and "region = [0.5, 0.0, 0.9, 1.0]" in process.output
+    for region, text in (([0.5, 0.0, 0.5, 1.0], ""), ([0.5, 0.0, 0.9, 1.0], "region = [0.5, 0.0, 0.9, 1.0]: left")):
+        request = SetParameters.Request(parameters=[Parameter("region", value=region).to_parameter_msg()])
+        (result,) = observer.call(SetParameters, "autofocus/set_parameters", request).results
+        assert result.successful == (not text) and result.reason.startswith(text), result.reason
 
 
 def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) -> None:

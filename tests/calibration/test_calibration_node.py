@@ -350,6 +350,16 @@ def test_another_folder_or_name_takes_effect_with_the_next_activation(
     monkeypatch.setattr(node._publisher, "publish", sent.append)
     assert node.set_parameters([Parameter("aperture_tolerance", value=0.05)])[0].successful
     assert (sent[-1].id, sent[-1].aperture_tolerance) == ("c", 0.05)
+    sent.clear()
+    assert node.set_parameters([Parameter("updates.surprises_max", value=5)])[0].successful and sent
+    followed: list[float] = []  # so does the mid range that a degauss ends at, whose limits may be set anew
+    monkeypatch.setattr(node._listener.history, "follow", lambda _law, middle: followed.append(middle))
+    mirror, known = run.mirror, {"neighbour_difference_max": 2.0, "signal_min": -0.5, "signal_max": 1.0}
+    message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators, **known)
+    message.working_aperture_diameter = 2.0 * mirror.working_radius
+    message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
+    node._on_mirror_info(message)
+    assert followed == [0.25] and sent[-1].id == "c"
     node.trigger_shutdown()
     assert manager.in_use is None
     node.destroy_node()

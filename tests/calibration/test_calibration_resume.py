@@ -19,7 +19,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.procedure.event_frames import Storing
+from dm_calibration.procedure.event_frames import _EVENTS, Storing
 from dm_calibration.procedure.outcome import Event, MapTaken
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -187,6 +187,33 @@ def test_only_the_same_plan_settings_and_mirror_go_on(tmp_path: Path) -> None:
     assert len(list((tmp_path / "unfinished").glob("*.set-aside"))) == 1
     begin()
     assert not opened(tmp_path, POKES, age_max=0.0, settle=1).resumed
+
+
+def test_a_run_that_goes_on_is_not_deleted_for_being_the_oldest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dm_calibration.procedure.unfinished_runs.WAITING_MAX", 0)
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, lagging_bench(), cut_before(3)).run()
+    run.journal.close()
+    assert opened(tmp_path, POKES).resumed.endswith("with 3 maps")
+
+
+def test_why_a_run_does_not_go_on_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, lagging_bench(), cut_before(3)).run()
+    run.journal.close()
+    files = len(list(Path("/proc/self/fd").iterdir()))
+    with monkeypatch.context() as full:
+        full.setattr("dm_calibration.procedure.run_journal.os.fdatasync", lambda _: os.fsync(10**6))
+        with pytest.raises(StoreError, match="no room for the maps"):
+            opened(tmp_path, POKES)
+    assert len(list(Path("/proc/self/fd").iterdir())) == files
+    monkeypatch.delitem(_EVENTS, "MapTaken")
+    other = opened(tmp_path, POKES)
+    assert not other.resumed and "'MapTaken' of another version" in " ".join(other.notes)
 
 
 def test_what_failed_last_is_tried_again(tmp_path: Path) -> None:

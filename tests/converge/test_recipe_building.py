@@ -179,6 +179,15 @@ def test_a_recipe_has_the_tilt_that_a_move_has(hold_tilt: bool) -> None:
                 assert found.error > as_built.error
 
 
+def test_what_their_own_maps_have_taught_the_calibration_does_not_move_recipes_again() -> None:
+    plant, target = LinearPlant(GAINS), FocusTarget(0.02)
+    recipe = RecipeBuilder(LOOP, plant, lambda: plant.time, BuildOptions(1e-9)).build(target)
+    taught = replace(MODEL, zernike_offset=MODEL.zernike_offset + 20e-9)
+    planner = Planner(CalibratedMirror(taught, LIMITS))
+    found = Corrections(recipe_book([recipe], planner, 100, 0), planner, learnt=True).find(target)
+    np.testing.assert_allclose(found.effective, recipe.effective, atol=1e-12)
+
+
 @pytest.mark.parametrize("share", [0.5, 0.97])
 def test_a_recipe_whose_tilt_a_limit_has_cut_is_replayed_as_it_was_measured(share: float) -> None:
     """Where limits bind tilt is given up first, which does not make it a recipe of another axis."""

@@ -295,7 +295,7 @@ def test_one_owner_of_the_mirror_at_a_time(driver: Driver) -> None:
 
 
 def test_unit_unplugged_during_a_ramp_and_its_return(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
-    start("dm_driver", "pdm_driver", parameters(unit, limits__slew_rate=2.0))
+    node = start("dm_driver", "pdm_driver", parameters(unit, limits__slew_rate=2.0))
     driver = Driver(observer, unit)
     driver.wait_active()
     driver.command(np.full(37, 1.0))
@@ -321,6 +321,12 @@ def test_unit_unplugged_during_a_ramp_and_its_return(start: Start, observer: Obs
     assert signals_of(unit.frames)[before] == pytest.approx(applied, abs=1e-9)
     answer = driver.set_signals(np.full(37, -1.0), wait=True)
     assert answer.error_code == ErrorCode.OK
+
+    unit.unplug()
+    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_LINK_LOST, "link lost again")
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE) * 2:
+        assert driver.change(transition)
+    wait_until(lambda: node.output.count("the safe shape was not reached") == 2, what="both reports")
 
 
 def test_a_unit_that_is_off_at_the_start_is_taken_when_it_comes(
@@ -423,7 +429,8 @@ def test_wrong_configurations_are_refused_in_words(
     for word in words:
         assert word in state.message
         assert word in node.output
-    assert driver.set_signals(np.zeros(37)).error_code == ErrorCode.DRIVER_INACTIVE
+    answer = driver.set_signals(np.zeros(37))
+    assert answer.error_code == ErrorCode.DRIVER_INACTIVE and all(word in answer.message for word in words)
     assert node.running and unit.clients == 0
     assert node.stop() == 0
 

@@ -91,13 +91,15 @@ class AutofocusAction(ProbeAction):
         if search.reason:
             self._log.info(f"the range was swept: {search.reason}")
         if search.current.peak is None:
+            left = "the mirror stays where it is"
             if math.isfinite(before):
                 self._probe.move(before)
+                left = "the mirror is back where it was"
             fault = exposure_fault(sample.regions[0]) if sample else ""
             raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
-                f"the range{fault and '; '}{fault}; the mirror is back where it was{self._remarks(search)}",
+                f"the range{fault and '; '}{fault}; {left}{self._remarks(search)}",
             )
         self._probe.move(search.current.step.curvature)
         return search.current.peak, search.current.config, self._remarks(search)

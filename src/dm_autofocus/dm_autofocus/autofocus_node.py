@@ -9,7 +9,7 @@ from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.clock import Clock, ClockType
 
 from dm_autofocus.autofocus_action import AutofocusAction
-from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics, tolerance_of
+from dm_autofocus.autofocus_parameters import PARAMETERS, check_changes, focus_optics, tolerance_of
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.focus_stack_action import FocusStackAction
 from dm_autofocus.images import exposure_fault
@@ -34,7 +34,7 @@ class AutofocusNode(ManagedNode):
     """See docs/camera.md for the interfaces; optics, sharpness and search are in `dm_autofocus`."""
 
     def __init__(self, **keywords: Any) -> None:
-        super().__init__("autofocus", PARAMETERS, **keywords)
+        super().__init__("autofocus", PARAMETERS, check=check_changes, **keywords)
         self._optics: FocusOptics
         self._probe = FocusProbe(self, self._values)
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.with_lease(qos.STATE))

@@ -201,7 +201,7 @@ class SettledGate:
             return "they carry no header.stamp, so nobody knows which focus they show; it must be above 0"
         if 2 * apart > timeout_s:  # a period may pass until an exposure begins, and another until it has arrived
             return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
-        if newest < self.settled_at:
-            early = self.settled_at - newest
-            return f"the newest is stamped {early:.3f} s before the shape stood; do the clocks agree?"
+        if not self.open_for(newest):
+            early = self.settled_at + self._stamp_lead - newest
+            return f"the newest was exposed {early:.3f} s before the shape stood; do the clocks agree?"
         return "they stopped coming"

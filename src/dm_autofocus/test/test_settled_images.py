@@ -69,3 +69,10 @@ def test_images_without_a_stamp_never_count() -> None:
     gate.sent(100.0, MOVE)
     gate.written(100.0 + MOVE, moving=False, reached=True)
     assert not gate.open_for(0.0)
+
+
+def test_a_stamp_at_the_end_of_a_long_exposure_is_told_as_the_reason() -> None:
+    gate = SettledGate(0.0, stamp_lead=3.0)
+    gate.sent(100.0)
+    gate.written(100.0, moving=False, reached=True)
+    assert "the newest was exposed 1.100 s before the shape stood" in gate.reason(101.9, 0.03, 2.0)

@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from dm_bringup.suite import ConfigError
+from dm_bringup.suite import ConfigError, flat
 
 Changes = Mapping[str, Mapping[str, Any]]
 
@@ -60,7 +60,7 @@ def values_of(text: str) -> dict[str, dict[str, Any]]:
     """The values of a parameter file by nodes. Raises ConfigError."""
     try:
         content = yaml.safe_load(text) or {}
-        return {_node_name(key): dict(section["ros__parameters"]) for key, section in content.items()}
+        return {_node_name(key): flat(section["ros__parameters"]) for key, section in content.items()}
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"not a parameter file: {type(error).__name__}: {error}") from error
 

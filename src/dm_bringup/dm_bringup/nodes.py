@@ -126,8 +126,14 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         "remappings": [remapping(rule) for rule in values["remap"].split()],
         "arguments": ["--ros-args", "--log-level", values["log_level"]],
         "respawn": flag("respawn", values["respawn"]),
-        "respawn_delay": float(values["respawn_delay"]),
+        "respawn_delay": number("respawn_delay", values["respawn_delay"]),
     }
+
+
+def namespace_of(values: Mapping[str, str], pushed: str) -> str:
+    """The namespace of the nodes, without slashes around it; an absolute one of `values` leaves what is `pushed`."""
+    own = values["namespace"]
+    return own.strip("/") if own.startswith("/") else f"{pushed.strip('/')}/{own.strip('/')}".strip("/")
 
 
 def companions_of(
@@ -146,7 +152,7 @@ def companions_of(
     """
     found: list[dict[str, Any]] = []
     places = {"mirror": values["place"]} if values["place"] else {}
-    prefix = "".join(f"{part.strip('/')}/" for part in (pushed, values["namespace"]) if part.strip("/"))
+    prefix = f"{namespace_of(values, pushed)}/".lstrip("/")
     if camera:
         places["camera_optical"] = f"{OPTICAL} {prefix}camera_link"
     for child, place in places.items():
@@ -154,6 +160,8 @@ def companions_of(
         names = ("x", "y", "z", "yaw", "pitch", "roll")
         if len(numbers) != len(names):
             raise ValueError(f"place = {place!r}: must be {' '.join(names)} frame")
+        for text in numbers:
+            number("place", text)
         options = dict(zip(names, numbers, strict=True)) | {"frame-id": frame, "child-frame-id": prefix + child}
         arguments = [word for name, text in options.items() for word in (f"--{name}", text)]
         node = {"name": f"{child}_place", "namespace": values["namespace"], "arguments": arguments}
@@ -172,6 +180,14 @@ def remapping(rule: str) -> tuple[str, str]:
     if not (old and new):
         raise ValueError(f"remap: {rule!r}: must be of the form from:=to")
     return old, new
+
+
+def number(name: str, text: str) -> float:
+    """Raises ValueError for what is none."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{name}: {text!r}: must be a number") from None
 
 
 def flag(name: str, text: str, other: str = "") -> bool:

@@ -31,8 +31,12 @@ class ConfigError(ValueError):
     """The configuration file cannot be used; the message says where and why."""
 
 
-def load_config(path: Path) -> Config:
-    """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError when it is none, or cannot be read."""
+def load_config(path: Path, namespace: str = "") -> Config:
+    """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError when it is none, or cannot be read.
+
+    Args:
+        namespace: of the nodes, without slashes around it; sections of other namespaces do not count. "" = any.
+    """
     try:
         content = yaml.safe_load(path.read_text())
     except OSError as error:
@@ -43,13 +47,25 @@ def load_config(path: Path) -> Config:
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
     result: Config = {}
     for key, section in content.items():
-        name = str(key).rsplit("/", 1)[-1]
+        place, _, name = str(key).rpartition("/")
+        if namespace and "*" not in place and place.strip("/") not in ("", namespace):
+            continue
         if name not in NAMES:
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
-        result[name] = section["ros__parameters"]
+        if name in result:
+            raise ConfigError(f"{path}: {key}: a second section of {name}; of which mirror is not told by a namespace")
+        result[name] = flat(section["ros__parameters"])
     return result
+
+
+def flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The parameters of a section by their names: `mirror: {serial: A}` is `mirror.serial: A` to ROS."""
+    found: dict[str, Any] = {}
+    for name, value in section.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
 
 
 class _Dumper(yaml.SafeDumper):

@@ -26,6 +26,7 @@ from dm_bringup.nodes import (
     LAUNCH_ARGUMENTS,
     arguments_of,
     companions_of,
+    namespace_of,
     node_environment,
     nodes_of,
 )
@@ -42,7 +43,8 @@ def start_nodes(context):
     # A debugger or the like that the user puts before the commands comes with a filter of its own.
     prefix = None if LaunchConfiguration("launch-prefix", default="").perform(context) else HELD_SIGNALS
     actions = []
-    config = load_config(Path(values["config"]))
+    pushed = LaunchConfiguration("ros_namespace", default="").perform(context)  # PushRosNamespace around this file
+    config = load_config(Path(values["config"]), namespace_of(values, pushed))
     for node in nodes_of(config):
         action = (LifecycleNode if node.lifecycle else Node)(
             package=node.package,
@@ -58,7 +60,6 @@ def start_nodes(context):
         actions.append(action)
     aggregation = Path(get_package_share_directory("dm_bringup")) / "launch" / "diagnostics.yaml"
     camera = config.get("virtual_bench", {}).get("camera.rate", 0.0) > 0.0
-    pushed = LaunchConfiguration("ros_namespace", default="").perform(context)  # PushRosNamespace around this file
     companions = companions_of(values, aggregation, camera, pushed)
     return actions + [Node(output="screen", **others) for others in companions]
 
@@ -77,18 +78,19 @@ def brought_up(action):
         asked.add(action)
         return change(Transition.TRANSITION_CONFIGURE)
 
-    def go_on(_context):
-        ours = bool(asked)
+    def go_on(context):
+        ours = bool(asked) and context.locals.event.goal_state == "inactive"
         asked.clear()
         return change(Transition.TRANSITION_ACTIVATE) if ours else []
 
     # A request that leaves before both sides have discovered each other is lost, and so is one to a process that died.
     start = TimerAction(period=DISCOVERY_S, actions=[OpaqueFunction(function=begin)])
-    configured = {"start_state": "configuring", "goal_state": "inactive"}
     return [
         RegisterEventHandler(OnProcessStart(target_action=action, on_start=[start])),
         RegisterEventHandler(
-            OnStateTransition(target_lifecycle_node=action, entities=[OpaqueFunction(function=go_on)], **configured)
+            OnStateTransition(
+                target_lifecycle_node=action, start_state="configuring", entities=[OpaqueFunction(function=go_on)]
+            )
         ),
     ]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dm_bringup.config_edit import edited
+from dm_bringup.config_edit import edited, values_of
 from dm_bringup.suite import ConfigError
 
 FILE = Path(__file__).parents[1] / "config" / "hardware.yaml"
@@ -69,3 +69,10 @@ def test_what_is_no_parameter_file_is_refused() -> None:
     for text in ("a: [", "- 1\n- 2\n", "/**/pdm_driver: 7\n"):
         with pytest.raises(ConfigError):
             edited(text, CHANGES)
+
+
+def test_a_value_that_stands_in_a_group_is_never_overruled_by_it() -> None:
+    text = "pdm_driver:\n  ros__parameters:\n    mirror:\n      wiring: trihex\n"
+    assert values_of(text) == {"pdm_driver": {"mirror.wiring": "trihex"}}
+    with pytest.raises(ConfigError, match="put in by hand"):
+        edited(text, CHANGES)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -84,8 +85,11 @@ def test_launch_files_start_what_up_starts(
     assert [isinstance(action, _Managed) for action in driven[-3:]] == [False, False, True]
     assert driven[-1].keywords["parameters"][1] == {"autostart": False} and len(driven) == len(nodes) + 2 * len(managed)
     asks, goes_on = _brought_up(*driven[-3:-1])
-    assert goes_on(None) == []  # somebody else configured it: activating it is theirs
-    assert asks(None) and goes_on(None) and goes_on(None) == []
+    events = (SimpleNamespace(event=SimpleNamespace(goal_state=state)) for state in ("unconfigured", "inactive"))
+    refused, done = (SimpleNamespace(locals=event) for event in events)
+    assert goes_on(done) == []  # somebody else configured it: activating it is theirs
+    assert asks(None) and goes_on(done) and goes_on(done) == []
+    assert asks(None) and goes_on(refused) == [] and goes_on(done) == []
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
 
@@ -119,11 +123,15 @@ def test_the_place_of_the_mirror_and_what_others_offer() -> None:
     (pushed, _bridge) = companions_of(given, SHARE, pushed="/robot1")
     child = pushed["arguments"].index("--child-frame-id") + 1
     assert pushed["arguments"][child] == "robot1/left/mirror" and pushed["namespace"] == given["namespace"]
+    (absolute, _bridge) = companions_of(given | {"namespace": "/left"}, SHARE, pushed="/robot1")
+    assert absolute["arguments"][child] == "left/mirror"
     (optical,) = companions_of(DEFAULTS, SHARE, camera=True)
     assert optical["arguments"][-4:] == ["--frame-id", "camera_link", "--child-frame-id", "camera_optical"]
     assert optical["arguments"][6:12] == ["--yaw", "-1.5707963", "--pitch", "0", "--roll", "-1.5707963"]
     with pytest.raises(ValueError, match="place = '1 2 map': must be x y z yaw pitch roll frame"):
         companions_of(DEFAULTS | {"place": "1 2 map"}, SHARE)
+    with pytest.raises(ValueError, match="place: 'x': must be a number"):
+        companions_of(DEFAULTS | {"place": "1 2 x 4 5 6 map"}, SHARE)
 
 
 def test_what_a_fleet_sets_reaches_every_node() -> None:
@@ -136,7 +144,12 @@ def test_what_a_fleet_sets_reaches_every_node() -> None:
         assert action["arguments"][-1] == "debug"
         assert (action["respawn"], action["respawn_delay"]) == (True, 2.0)
     assert arguments_of(NODES[0], DEFAULTS | {"config": "c.yaml"})["parameters"] == ["c.yaml"]
-    wrong = {"respawn": "must be true or false", "autostart": "must be true, events or false", "remap": "must be of"}
+    wrong = {
+        "respawn": "must be true or false",
+        "respawn_delay": "must be a number",
+        "autostart": "must be true, events or false",
+        "remap": "must be of",
+    }
     for name, text in wrong.items():
         with pytest.raises(ValueError, match=f"{name}.*{text}"):
             arguments_of(NODES[1], DEFAULTS | {name: "perhaps"})

@@ -15,7 +15,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from dm_bringup import suite as suite_module
-from dm_bringup.suite import RESTART_S, Suite, load_config, save_config
+from dm_bringup.suite import RESTART_S, ConfigError, Suite, load_config, save_config
 from dm_common.ros.domains import own_domain
 
 
@@ -46,6 +46,17 @@ def test_texts_stay_texts_on_their_way_to_the_nodes(tmp_path: Path, text: str) -
         node.destroy_node()
     finally:
         context.shutdown()
+
+
+def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("/left/pdm_driver: {ros__parameters: {volts: {min: 0.0, max: 100.0}, simple: 1}}\n")
+    assert load_config(file) == {"pdm_driver": {"volts.min": 0.0, "volts.max": 100.0, "simple": 1}}
+    with file.open("a") as lines:
+        lines.write("/right/pdm_driver: {ros__parameters: {volts.max: 300.0}}\n")
+    with pytest.raises(ConfigError, match="/right/pdm_driver: a second section of pdm_driver"):
+        load_config(file)
+    assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0}}
 
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:

@@ -84,7 +84,7 @@ def put_updates(
         setattr(message, name, doubles(getattr(fit, name)))
     warm_error = kept.warm_error(temperature)
     for promise in (message, message.hysteresis):  # no bound is below what maps have shown since one last agreed
-        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, kept.disagreement), warm_error)
+        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), warm_error)
     message.revision = drift.revision
     message.checked = time_message(drift.checked_ns)
     message.creep_shown = drift.trust

@@ -83,7 +83,7 @@ class CalibrationNode(ManagedNode):
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
 
     def _on_parameters(self, changes: Mapping[str, Any]) -> None:
-        if {"aperture_tolerance", "calibrated_error_max"} & set(changes):
+        if {"aperture_tolerance", "calibrated_error_max", "updates.surprises_max"} & set(changes):
             self._manager.publish_again()  # others judge by them
 
     def configure(self) -> None:
@@ -151,6 +151,8 @@ class CalibrationNode(ManagedNode):
             self._listener.history.forget()
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
+        if before is not None and before.limits.middle != mirror.limits.middle:
+            self._manager.publish_again()  # a degauss ends there, and its hysteresis is followed from there
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
         self._load_pending()
 

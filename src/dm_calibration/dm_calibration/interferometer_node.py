@@ -28,6 +28,7 @@ from dm_calibration.acquisition.reference_surface import corrections
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_calibration.interferometer_parameters import PARAMETERS, configure
 from dm_calibration.map_files import MapFileError, SurfaceMap
+from dm_calibration.map_files.datx_structure import as_text
 from dm_calibration.optics.orientation import Orientation
 from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
@@ -76,7 +77,7 @@ class InterferometerNode(ManagedNode):
             raise parameters.ParameterError(wrong)
 
     def configure(self) -> None:
-        settings, self._reference = configure(self._values)
+        settings, self._reference = configure(self._values, self.resolve_topic_name)
         self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
         if topic := self._values["zernike_topic"]:
             self._listen_to(topic)
@@ -156,11 +157,13 @@ class InterferometerNode(ManagedNode):
     def _on_new_file(self, path: Path) -> None:
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""
         try:
-            surface, measured = self._read(path)
+            self._take(path)
         except Exception as error:  # whatever one file does, the next one must be taken
             known = isinstance(error, CodedError)
-            self._warn_of_file(str(error) if known else f"{path}: {type(error).__name__}: {error}")
-            return
+            self._warn_of_file(str(error) if known else f"{as_text(path)}: {type(error).__name__}: {error}")
+
+    def _take(self, path: Path) -> None:
+        surface, measured = self._read(path)
         # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
         before = self._published.pop(str(path), None)
         known = before is not None and before == surface.sha256

@@ -1,6 +1,6 @@
 """Parameters of the node `interferometer`, and what they mean to the library."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,13 @@ PARAMETERS = (
 )
 
 
-def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMap | None]:
+def configure(
+    values: Mapping[str, Any], resolve: Callable[[str], str] = lambda topic: f"/{topic.strip('/')}"
+) -> tuple[AcquisitionSettings, SurfaceMap | None]:
     """What maps are taken by, and the reference surface; None = there is none.
+
+    Args:
+        resolve: full name of a topic of the node; by default of one in no namespace.
 
     Raises:
         ValueError: values that contradict each other, or no map to refer to.
@@ -64,12 +69,12 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
         raise ValueError(f"zernike_topic = {topic!r}: {', '.join(others)} must be empty beside it")
     if len(values["retrace"]) not in (0, RETRACE_SIZE):
         raise ValueError(f"retrace: {len(values['retrace'])} numbers, must be {RETRACE_SIZE} or none")
-    if topic.strip("/") == "zernike":
-        raise ValueError(f"zernike_topic = {topic!r}: is what this node itself publishes")
     try:
         validate_topic_name(topic or "none")
     except InvalidTopicNameException as error:
         raise ValueError(f"zernike_topic = {topic!r}: {error}") from error
+    if topic and resolve(topic) == resolve("zernike"):
+        raise ValueError(f"zernike_topic = {topic!r}: is what this node itself publishes")
     path, unit = values["reference_surface"], values["xyz_unit"]
     expected = values["wavelength.expected"], values["wavelength.tolerance"]
     folder = Path(values["watch_folder"]).expanduser() if values["watch_folder"] else None

@@ -203,6 +203,18 @@ def test_stopping_ends_a_measurement(tmp_path: Path, bench: Any) -> None:
     assert [error_code(error) for error in errors] == [ErrorCode.INTERFEROMETER_INACTIVE]
 
 
+def test_a_thread_that_is_late_to_end_takes_no_files_after_a_new_start(
+    tmp_path: Path, bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, late = bench(tmp_path), threading.enumerate()[-1]
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "join", lambda *_: None)  # a file that takes longer to read than it is waited
+        one.acquisition.stop()
+    one.acquisition.start()
+    late.join(5)
+    assert late.name == "folder_watch" and not late.is_alive()
+
+
 def test_settings_that_contradict_each_other(bench: Any) -> None:
     with pytest.raises(ValueError, match="trigger_command needs watch_folder"):
         bench(None, ["trigger"])

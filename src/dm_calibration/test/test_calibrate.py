@@ -73,8 +73,9 @@ def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         (tmp_path / f"{number:03d}.dat").write_bytes(dat_bytes(counts, pitch=PITCH, time=1_700_000_000 + 5 * number))
     np.savetxt(tmp_path / "commands.csv", commands, delimiter=",")
     made = run_example("calibrate_folder.py", tmp_path, monkeypatch)
-    (file,) = tmp_path.glob("*.h5")
-    calibration = CalibrationStore(tmp_path).load(file.stem)
+    (file,) = tmp_path.glob("calibrations/*.h5")
+    assert outcome_of(tmp_path, commands, None, mirror).records, "the folder still holds maps only"
+    calibration = CalibrationStore(file.parent).load(file.stem)
     assert f"stored as {file}" in capsys.readouterr().out
     assert calibration.id == made["calibration"].id  # type: ignore[attr-defined]
     assert calibration.limitations == (calibration.limitations[0],)  # no findings of the poke check among them

@@ -197,7 +197,11 @@ def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibrat
     known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), held_out, 0.05, 120, ()))
     start = known.created_ns * 1e-9
     # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.
-    for growth, days, reason in ((1e-10, 40.0, "the error grows by +3"), (0.0, 24 + 30.0, "no growth")):
+    for growth, days, reason in (
+        (1e-10, 40.0, "the error grows by +3"),
+        (5e-11, 24 + 30.0, "within the promise until then"),
+        (0.0, 24 + 30.0, "no growth"),
+    ):
         until, text = valid_until(checks_of(known, growth), 5e-9, start)
         assert (until - start) / 86400.0 == pytest.approx(days, abs=3.0) and reason in text
     assert "too few checks" in valid_until(checks_of(known, 1e-10, 3), 5e-9, start)[1]

@@ -161,7 +161,7 @@ def test_folder_that_is_a_file(tmp_path: Path, calibration: Calibration) -> None
 
 
 @pytest.mark.parametrize(
-    "name", ["../PDM_1", "/etc/passwd", "a/b", ".hidden", "", "..", "PDM_1.h5/..", "x\ny", "~/PDM_1.h5"]
+    "name", ["../PDM_1", "/etc/passwd", "a/b", ".hidden", "", "..", "PDM_1.h5/..", "x\ny", "~/PDM_1.h5", "~no/PDM_1.h5"]
 )
 def test_names_do_not_leave_the_folder(name: str, tmp_path: Path, calibration: Calibration) -> None:
     (tmp_path / "inner").mkdir()

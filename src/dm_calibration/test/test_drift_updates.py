@@ -16,7 +16,8 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.check_log import read_checks
-from dm_calibration.recalibration.drift import Drift, DriftRates
+from dm_calibration.recalibration.displaced import described
+from dm_calibration.recalibration.drift import Displaced, Drift, DriftRates
 from dm_calibration.recalibration.updates import InUse, RecalibrationManager, UpdateOptions, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import HASH, read_image, write_image
@@ -154,7 +155,7 @@ def test_one_map_of_an_actuator_that_sticks_widens_the_bound_for_every_other_sha
     shapes = rng.uniform(-0.7, 0.7, (20, bench.mirror.actuators))
     shapes[0, 6] = 0.35
     first = shown(shapes[0]).comparison.max_zernike
-    bound = in_use(updates).disagreement
+    bound = known(updates).disagreement
     errors = [shown(wanted).comparison.max_zernike for wanted in shapes[1:]]
     assert max(errors) > 2.0 * first
     assert max(errors) < bound < 4.0 * max(errors)
@@ -213,6 +214,24 @@ def test_an_actuator_that_stands_where_it_should_is_not_given_up(
     with pytest.raises(MapNotUsableError, match=r"actuator 7 stands at .*: this shape does not show that it fails"):
         updates.take(bench.measure("fine"), bench.settled(), without=[6])
     assert known(updates).revision == 0 and not known(updates).given_up
+
+
+def test_an_actuator_without_any_influence_is_not_given_up(made: Made, tmp_path: Path) -> None:
+    bench, calibration = SteadyMirror(), made[1]
+    moves, fit = np.arange(bench.mirror.actuators) != 4, calibration.fit
+    none = {name: getattr(fit, name) * moves for name in ("influence_zernike", "influence_sag", "response")}
+    bench.plant.influence = bench.plant.influence * moves
+    bench.clock_ns = calibration.stamp_ns
+    updates = begun((bench, replace(calibration, fit=replace(fit, **none))), tmp_path)
+    with pytest.raises(MapNotUsableError, match=r"actuator 5 stands at .*: this shape does not show that it fails"):
+        updates.take(bench.measure("fine"), bench.settled(), without=[4])
+
+
+def test_the_last_actuator_is_never_offered_to_go_on_without() -> None:
+    dead, three = {1: Displaced(-0.5, 1.0)}, np.full(3, 0.5)
+    for given_up, offered in (([False] * 3, True), ([True, False, True], False)):
+        text = described(dead, three, np.array(given_up), np.zeros(3, bool))
+        assert ("./dm check --without 2" in text) == offered and "as if it were dead (100%)" in text
 
 
 def test_a_weakened_actuator_is_named_with_its_probability(bench: SteadyMirror, updates: RecalibrationManager) -> None:
@@ -325,11 +344,12 @@ def test_nothing_is_used_before_a_second_shape_has_borne_it_out(
 
 
 def test_a_bad_map_widens_the_bound_at_once_and_a_good_one_restores_it(
-    bench: SteadyMirror, updates: RecalibrationManager
+    bench: SteadyMirror, made: Made, tmp_path: Path
 ) -> None:
     told = {}
     for name, bump in (("first", 0.0), ("bad", 40e-9), ("good", 0.0)):
-        updates.take(bench.measure(name, bump=bump), bench.settled())
+        begun(made, tmp_path).take(bench.measure(name, bump=bump), bench.settled())
+        updates = begun(made, tmp_path)  # also across a restart
         message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
         put_updates(message, in_use(updates), np.nan, [], False)
         told[name] = message.held_out_max_zernike
@@ -380,7 +400,7 @@ def test_a_dry_run_compares_only(bench: SteadyMirror, updates: RecalibrationMana
         (lambda m: replace(m, sag=np.where(m.points.x > -0.3, np.nan, m.sag)), "of the sampled area has data"),
         (lambda m: replace(m, coefficients=m.coefficients[:15]), "15 Zernike terms, the calibration has 21"),
         (lambda m: replace(m, coefficients=np.full(21, np.nan)), "coefficients: hold values that are not finite"),
-        (lambda m: replace(m, stamp_ns=1), "measured before the calibration was finished"),
+        (lambda m: replace(m, stamp_ns=1), r"stamp \d+\.\d{3} s before the calibration was finished"),
     ],
 )
 def test_maps_that_cannot_be_compared_are_refused(
@@ -518,4 +538,8 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
     assert (good.accepted, bad.accepted) == (1, 0) and good.time < bad.time == pytest.approx(1e-9 * bench.clock_ns)
     assert good.max_zernike < 2e-9 < bad.max_zernike and good.surprise < 2.0 < bad.surprise
     assert 1 <= good.actuator <= bench.mirror.actuators
+    for taken in (3, 1):
+        updates.take(bench.measure("bad"), bench.settled())
+        assert len(read_checks(file)) == taken
+        file.write_bytes(b"")
     assert read_checks(tmp_path / "none.csv") == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -54,13 +55,21 @@ def test_maps_of_all_makers(tmp_path: Path, name: str, content: bytes) -> None:
     """What every format owes: m of sag, row 0 = top, NaN = no data, wavelength, pitch; and no half file is a map."""
     found = read_map(write(tmp_path, name, content), xyz_unit="nm")
     np.testing.assert_allclose(found.sag, 1e-9 * SAG, rtol=1e-6, atol=5e-12)
-    assert found.format == name.partition(".")[2]
+    assert found.format == name.partition(".")[2] and found.sag.dtype == np.float64
     assert found.wavelength == pytest.approx(632.8e-9)
     assert found.pitch == (None if found.format == "4D" else pytest.approx(24e-6))
     whole = len(content.rstrip(b" \n#"))  # behind the last value a text says nothing of the map
     for cut in (0, 3, 30, whole // 2, whole - 1):
         with pytest.raises(MapFileError):
             read_map(write(tmp_path, "cut", content[:cut]), xyz_unit="nm")
+
+
+def test_a_name_that_is_no_text_goes_into_messages_all_the_same(tmp_path: Path) -> None:
+    name = os.fsdecode(b"Pr\xfcfung.dat")  # of a machine with another code page
+    assert read_map(write(tmp_path, name, dat_bytes(COUNTS))).file.encode().endswith(b"Pr\\udcfcfung.dat")
+    with pytest.raises(MapFileError) as caught:
+        read_map(write(tmp_path, name, b"no map"))
+    assert b"Pr\\udcfcfung.dat: begins with" in str(caught.value).encode()
 
 
 def test_facts_of_a_fits_file(tmp_path: Path) -> None:
@@ -95,6 +104,11 @@ def test_facts_of_a_fits_file(tmp_path: Path) -> None:
 def test_a_fits_file_that_makes_no_sense_is_refused(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
     with pytest.raises(MapFileError, match=re.escape(words)):
         read_map(write(tmp_path, "bad.fits", fits_bytes(SAG, **cards)))
+
+
+def test_a_unit_that_no_fits_file_has_is_told_as_the_parameter(tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match="xyz_unit = 'waves': must be a length"):
+        read_map(write(tmp_path, "bad.fits", fits_bytes(SAG, BUNIT=None)), xyz_unit="waves")
 
 
 def test_a_fits_file_whose_checksum_does_not_agree_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from std_msgs.msg import Header
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.interferometer_messages import sensor_map, zernike_message
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
+from dm_calibration.interferometer_parameters import PARAMETERS, configure
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import TERM_RMS, TERMS, basis
@@ -112,3 +114,10 @@ def test_waiting_ends_in_time_and_when_it_is_stopped() -> None:
     with pytest.raises(Refusal) as stopped:
         sensor.acquire(5.0)
     assert stopped.value.error_code == ErrorCode.INTERFEROMETER_INACTIVE
+
+
+def test_a_topic_of_another_namespace_is_not_the_nodes_own() -> None:
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    for topic, own in (("/zernike", False), ("/left/zernike", True), ("zernike", True), ("sensor/zernike", False)):
+        with pytest.raises(ValueError, match="is what this node itself") if own else nullcontext():
+            configure(values | {"zernike_topic": topic}, lambda name: name if name[0] == "/" else f"/left/{name}")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self, TypedDict, Unpack
 
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from dm_msgs.srv import (
     Flatten,
     IngestFile,
@@ -184,7 +184,6 @@ class DeformableMirrorClient(Connection):
     def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
         if self.hear("surface_map", Image, qos.MAP):
-            self.hear("surface_map_info", SurfaceMapInfo, qos.MAP)
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
             time.sleep(0.3)  # the publisher must have discovered this subscription too
         response = self.measure(label, timeout_s)

@@ -22,7 +22,7 @@ def _flag(value: Any) -> bool:
     return bool(value)
 
 
-#: How a value becomes one of this type; TypeError or ValueError where it cannot.
+#: How a value becomes one of this type; TypeError, ValueError or OverflowError where it cannot.
 _CONVERTED: dict[str, Callable[[Any], Any]] = {
     "boolean": _flag,
     "double": float,
@@ -55,7 +55,7 @@ def _field(name: str, value: Any, type_name: str) -> Any:
                 raise TypeError("text")
             return [_one(name, each, element) for each in value]
         return _one(name, value, element)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, DeformableMirrorError):
             raise
         text = f"{name} = {value!r}: must be {type_name.replace('boolean', 'true or false')}"

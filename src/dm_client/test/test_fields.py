@@ -36,6 +36,7 @@ def test_what_means_the_same_is_taken() -> None:
         (UpdateCalibration.Request, {"without": [-1]}, ErrorCode.OUT_OF_RANGE, "without = -1: must be 0 to"),
         (UpdateCalibration.Request, {"without": 5}, ErrorCode.INVALID_ARGUMENT, "without = 5: must be sequence"),
         (SetSignals.Request, {"signals": ["a"]}, ErrorCode.INVALID_ARGUMENT, "signals = .'a'.: must be sequence"),
+        (SetSignals.Request, {"signals": [10**400]}, ErrorCode.INVALID_ARGUMENT, "signals = .10+.: must be sequence"),
         (SetSignals.Request, {"signals": "123"}, ErrorCode.INVALID_ARGUMENT, "signals = '123': must be sequence"),
         (SetSignals.Request, {"take_over": "no"}, ErrorCode.INVALID_ARGUMENT, "take_over = 'no': must be true or"),
         (SetSignals.Request, {"wait": 2}, ErrorCode.INVALID_ARGUMENT, "wait = 2: must be true or false"),

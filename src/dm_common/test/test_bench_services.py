@@ -1,14 +1,18 @@
-"""A map and an interferometer that dies meanwhile."""
+"""A map and an interferometer that dies meanwhile; and the way back when the process ends."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
+from dm_msgs.srv import SetSignals
+from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.ros import bench_services
 from dm_common.ros.bench_services import BenchServices
+from ros_fixtures import Observer
 
 #: Longest pause before a node that died is started again, s.
 BACK_OFF_S = 30.0
@@ -52,3 +56,23 @@ def test_a_map_is_taken_again_when_the_interferometer_is_back_but_not_for_ever(m
         bench.measure("rest")
     assert refused.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE and bench.tries == 5
     assert not isinstance(refused.value, MeasurementError)  # which would be tried again
+
+
+def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: Observer) -> None:
+    asked: list[str] = []
+
+    def serve(name: str) -> None:
+        def answer(_request: Any, response: Any) -> Any:
+            asked.append(name)
+            return response
+
+        observer.node.create_service(SetSignals, name, answer)
+
+    for name in ("/set_signals", "/left/set_signals", "/left/remapped"):
+        serve(name)
+    for remap in ([], ["--ros-args", "-r", "set_signals:=remapped"]):
+        node = Node("calibration", namespace="/left", cli_args=remap, context=observer.node.context)
+        bench = BenchServices(node, {"settle_time": 0.0, "driver_timeout": 5.0})
+        assert bench.rest_at_exit(np.zeros(37)) == "the mirror is back at mid range"
+        node.destroy_node()
+    assert asked == ["/left/set_signals", "/left/remapped"]

@@ -135,6 +135,7 @@ def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observe
     assert node.did[-2:] == ["configure 4", "activate"]
     node.trigger_shutdown()
     assert node.did[-2:] == ["deactivate", "clean up"] and not node.configured
+    assert node.inactive() == "example was shut down: start its process again"
     node.destroy_node()
 
 

@@ -6,13 +6,15 @@ import math
 import threading
 import time
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import Converge, Degauss, MoveFocus
 from dm_msgs.msg import ErrorCode, FocusRequest
 from dm_msgs.srv import Flatten, HoldMirror, PredictError, SetSignals
+from rclpy.time import Time
 from std_msgs.msg import Int32
 
 from dm_common.errors import Refusal
@@ -307,3 +309,15 @@ def test_call_gives_up_on_a_silent_server_and_on_cancel(observer: Observer) -> N
 def test_sleep_ends_early_when_cancelled(observer: Observer) -> None:
     assert sleep(observer.node.get_clock(), 0.05)
     assert not sleep(observer.node.get_clock(), 60.0, cancelled=lambda: True)
+
+
+@pytest.mark.parametrize(("simulated", "step_s"), [(False, 3600.0), (False, -3600.0), (True, -3600.0)])
+def test_sleep_lasts_as_long_when_the_clock_is_set_meanwhile(simulated: bool, step_s: float) -> None:
+    began = time.monotonic()
+
+    def now() -> Time:
+        passed = time.monotonic() - began
+        return Time(seconds=1e9 + passed + (step_s if passed > 0.1 else 0.0))
+
+    assert sleep(cast(Any, SimpleNamespace(now=now, ros_time_is_active=simulated)), 0.3)
+    assert 0.3 <= time.monotonic() - began < 3.0

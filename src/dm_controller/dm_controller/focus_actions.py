@@ -15,7 +15,7 @@ from dm_msgs.msg import Calibration, FocusRequest, FocusState
 from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ClockError, ErrorCode, Refusal
 from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import Health, ManagedNode
@@ -103,11 +103,12 @@ class FocusHost(ManagedNode, ABC):
         return self.state(so_far)
 
     def await_start(self) -> None:
-        """Wait until calibration and driver have been heard of, which takes a moment after the start; START_S then."""
+        """Wait for word of calibration, driver and simulated time, a moment after the start; `START_S` then at most."""
         while time.monotonic() < self._started + START_S:
             with self.controller() as (controller, now):
                 refusal = controller.unavailable(now)
-            if refusal is None or refusal.error_code not in (ErrorCode.NOT_CALIBRATED, ErrorCode.DRIVER_UNAVAILABLE):
+            unheard = refusal and refusal.error_code in (ErrorCode.NOT_CALIBRATED, ErrorCode.DRIVER_UNAVAILABLE)
+            if now.ns and not unheard:
                 return
             time.sleep(POLL_S)
 
@@ -151,7 +152,10 @@ class MoveFocusAction:
 
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
         started, result = time.monotonic(), without_figures(MoveFocus.Result())
-        outcome, result.error_code, result.message = self._carry_out(handle, result)
+        try:
+            outcome, result.error_code, result.message = self._carry_out(handle, result)
+        except ClockError as error:
+            outcome, result.error_code, result.message = "abort", error.error_code, str(error)
         result.duration = time.monotonic() - started
         return outcome, result
 

@@ -193,12 +193,11 @@ class FocusController:
                 assert active is not None  # else it is refused
                 raise unreachable(move, active, tolerance)
             if not dry_run:
+                now.check()
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)
-                if degaussed is not None or (move.degauss is None and self.conditioning.run is None):
-                    effects += self._go(order, move, now)
-                else:
-                    effects += self._condition(order, move, now)
+                at_once = degaussed is not None or (move.degauss is None and self.conditioning.run is None)
+                effects += (self._go if at_once else self._condition)(order, move, now)
         except Refusal as refusal:
             if self.active is None and refusal is self.not_calibrated and not dry_run:
                 refusal = self.monitor.held(order.request) or refusal  # the first calibration runs, for example

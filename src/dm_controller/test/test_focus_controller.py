@@ -28,7 +28,7 @@ from dm_msgs.msg import (
 )
 from std_msgs.msg import Header
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ClockError, ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import UNSEEN, CreepRecord, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
@@ -392,9 +392,9 @@ def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its
     fresh.use(None, None)
     refusal = fresh.unavailable(bench.now)
     assert refusal is not None and "comes within seconds of this node's start" in str(refusal)
-    asked = iter([fresh, fresh, bench.controller])
-    started = time.monotonic()
-    host = cast(Any, SimpleNamespace(_started=started, controller=lambda: nullcontext((next(asked), bench.now))))
+    early = Moment(0, 0.0, bench.time, simulated=True)
+    asked = iter([(fresh, bench.now), (fresh, bench.now), (bench.controller, early), (bench.controller, bench.now)])
+    host = cast(Any, SimpleNamespace(_started=time.monotonic(), controller=lambda: nullcontext(next(asked))))
     FocusHost.await_start(host)
     assert not list(asked)
     host._started -= START_S
@@ -805,6 +805,10 @@ def corrected(bench: Bench) -> None:
     bench.wait(20.0)
 
 
+def timeless(_bench: Bench) -> None:
+    raise ClockError("ROS time did not advance")
+
+
 @pytest.mark.parametrize(
     ("accident", "code"),
     [
@@ -813,6 +817,7 @@ def corrected(bench: Bench) -> None:
         (replaced, ErrorCode.PREEMPTED),
         (Bench.degauss, ErrorCode.PREEMPTED),
         (corrected, ErrorCode.OK),
+        (timeless, ErrorCode.TIMEOUT),
     ],
 )
 def test_a_shape_that_is_lost_while_it_settles_is_no_success(
@@ -830,8 +835,17 @@ def test_a_shape_that_is_lost_while_it_settles_is_no_success(
     )
     goal = MoveFocus.Goal(request=FocusRequest(curvature=0.02))
     handle: Any = SimpleNamespace(request=goal, is_cancel_requested=False, publish_feedback=lambda _feedback: None)
-    outcome, error_code, _ = focus_actions.MoveFocusAction(node, VALUES)._carry_out(handle, MoveFocus.Result())
-    assert (outcome, error_code) == ("abort" if code else "succeed", code)
+    outcome, result = focus_actions.MoveFocusAction(node, VALUES)._run(handle)
+    assert (outcome, result.error_code) == ("abort" if code else "succeed", code)
+    assert result.state.curvature == 0.02 and result.duration >= 0.0
+
+
+def test_nothing_moves_before_simulated_time_has_begun(bench: Bench) -> None:
+    request, early = FocusRequest(curvature=0.01), Moment(0, 0.0, bench.time, simulated=True)
+    order, effects = bench.controller.request(request, early)
+    assert order.refusal is not None and order.refusal.error_code == ErrorCode.TIMEOUT
+    assert "/clock" in str(order.refusal) and not any(isinstance(effect, SendCommand) for effect in effects)
+    assert bench.controller.request(request, early, dry_run=True)[0].refusal is None
 
 
 def test_an_order_that_takes_too_long(bench: Bench) -> None:

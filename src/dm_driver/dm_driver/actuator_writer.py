@@ -63,7 +63,10 @@ class ActuatorWriter(WriterThread):
             return None
 
     def disable(self, timeout_s: float) -> Outcome:
-        """Ramp to the safe shape, then forbid writes. Commands are refused from the call on."""
+        """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.
+
+        A unit may take its frames slower than the limits allow: it is given up `timeout_s` after the last that it took.
+        """
         with self._change:
             self._accepting = False
             if not self._enabled:
@@ -73,7 +76,9 @@ class ActuatorWriter(WriterThread):
                 self._put(move)
             else:
                 move.finish(Outcome.LINK_LOST)
-        outcome = move.wait(timeout_s)
+        written = -1
+        while (outcome := move.wait(timeout_s)) is None and written != self.counters.frames:
+            written = self.counters.frames
         with self._change:
             self._enabled = self._rewrite_due = False
             self._queue.end_all(Outcome.STOPPED, self._shape)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import Refusal
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.moves import WriterState
@@ -43,19 +43,21 @@ class LinkLog:
         return (severity, text) if key != before else None
 
 
-def driver_health(writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int]) -> Health:
-    """Judge the driver: level, one line for a person, and the counts since the configuration.
+def driver_health(
+    writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int], trouble: str = ""
+) -> Health:
+    """Judge the driver: level, one line for a person, and counts: of refusals since the start, else since the
+    configuration.
 
     Args:
         writer: None when the driver is not configured.
-        refusal: of the last command, or of the configuration.
+        refusal: of the last command.
         refused: number of refused commands by the name of their code.
+        trouble: why the configuration was refused; "" = it was not.
     """
     values: dict[str, object] = {f"refused {name}": count for name, count in sorted(refused.items())}
     if writer is None:
-        if refusal is not None and refusal.error_code == ErrorCode.INVALID_ARGUMENT:
-            return Health(ERROR, str(refusal), values)
-        return Health(WARN, "not configured", values)
+        return Health(ERROR, trouble, values) if trouble else Health(WARN, "not configured", values)
     state, counters = writer.state(), writer.counters
     values |= {
         "refused total": sum(refused.values()),

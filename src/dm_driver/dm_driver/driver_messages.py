@@ -58,8 +58,8 @@ def state_message(
     message.degausses, message.turns = state.degausses, state.turns
     if state.enabled and not state.link_up:
         message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, state.fault
-    flags = np.zeros(configuration.limiter.limits.actuators, dtype=np.uint8)
-    flags[~configuration.output.connected] |= ActuatorState.FLAG_UNUSED
+    connected = configuration.output.connected
+    flags = np.where(connected, 0, ActuatorState.FLAG_UNUSED).astype(np.uint8)
     if refusal is not None and refusal.actuators is not None:
         flags[refusal.actuators] |= ActuatorState.FLAG_REFUSED
     if state.requested is not None and state.applied is not None and state.volts is not None:
@@ -73,9 +73,9 @@ def state_message(
         # Quantisation may leave a signal up to one code short of its limit.
         code = configuration.output.scale.resolution
         at_limit = (state.applied <= limits.low + code) | (state.applied >= limits.high - code)
-        flags[at_limit] |= ActuatorState.FLAG_AT_LIMIT
+        flags[connected & at_limit] |= ActuatorState.FLAG_AT_LIMIT
         if message.moving:
-            flags[np.abs(state.requested - state.applied) > code] |= ActuatorState.FLAG_RAMPING
+            flags[connected & (np.abs(state.requested - state.applied) > code)] |= ActuatorState.FLAG_RAMPING
     message.flags = array.array("B", flags.tobytes())
     return message
 

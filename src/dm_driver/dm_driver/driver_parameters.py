@@ -52,7 +52,11 @@ PARAMETERS: Final = (
         "EDAC40 over TCP: large ramps go no faster than the unit acknowledges, so that a link that vanishes in a move "
         "leaves at most one step. False = never wait: for a unit that acknowledges late, where speed counts more.",
     ),
-    Parameter("electronics.timeout", real(1.0, 0.01, 60.0, "s"), "Longest wait for the electronics."),
+    Parameter(
+        "electronics.timeout",
+        real(1.0, 0.01, 60.0, "s"),
+        "Longest wait for the electronics; for a TCP connection to come about it is 5 s.",
+    ),
     *parameters_of("framed_serial.", FrameFormat),
     Parameter("volts.dac_at_zero", real(REQUIRED, unit="V"), "DAC output for code 0 (EDAC40 as delivered: -6)."),
     Parameter("volts.dac_at_full", real(REQUIRED, unit="V"), "DAC output for the full-scale code (EDAC40: +6)."),

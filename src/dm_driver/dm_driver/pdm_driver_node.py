@@ -65,7 +65,8 @@ class PdmDriverNode(ManagedNode):
     # Lifecycle
 
     def refused(self, reason: str) -> None:
-        self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {reason}")
+        self._gate.trouble = f"configuration refused: {reason}"
+        self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, self._gate.trouble)
         self._publish_state()
 
     def configure(self) -> None:
@@ -80,7 +81,7 @@ class PdmDriverNode(ManagedNode):
         self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
         self._gate.configuration = configuration
-        self._gate.refusal = None
+        self._gate.refusal, self._gate.trouble = None, ""
         self._gate.writer = ActuatorWriter(
             configuration.electronics,
             configuration.output,
@@ -140,7 +141,7 @@ class PdmDriverNode(ManagedNode):
         outcome = writer.disable(ramp_time + self._values["electronics.timeout"] + MARGIN_S)
         if outcome is Outcome.REACHED:
             self.get_logger().info(f"{occasion}: the mirror stands in the safe shape")
-        elif writer.state().sequence == 0:
+        elif writer.state().applied is None:
             self.get_logger().info(f"{occasion}: the drive electronics were never there, nothing was written")
         else:
             self.get_logger().error(
@@ -249,7 +250,7 @@ class PdmDriverNode(ManagedNode):
             self._published_at = time.monotonic()
 
     def health(self) -> Health:
-        return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused)
+        return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused, self._gate.trouble)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -118,7 +118,7 @@ class SafetyLimiter:
         if previous is not None:
             change = np.abs(shape - previous)
             rule = f"must be at most {limits.step:g} (limits.step)"
-            _refuse(ErrorCode.INTERNAL, "step", change, ~(change <= limits.step + _ROUNDING), rule)
+            _refuse(ErrorCode.INTERNAL, "step", change, ~(change <= limits.step * (1.0 + SLACK) + _ROUNDING), rule)
 
     def ramp(self, start: Shape, target: Shape) -> Iterator[Shape]:
         """Yield the shapes to write on the way from `start` (excluded) to `target` (included, exactly).

@@ -149,9 +149,9 @@ class WriterThread:
                         queue.pending = None
                     elif self._watchdog.expired(now) and not busy:
                         self._begin(Move(Kind.SAFE, self._safe_shape))
-                    due, action = (
-                        (self._write_at, self._step) if queue.current is not None else (self._check_at, self._check)
-                    )
+                    due, action = self._check_at, self._check
+                    if queue.current is not None and self._write_at <= due:
+                        due, action = self._write_at, self._step
                 if now >= due:
                     return action
                 watchdog = self._watchdog.deadline if self._watchdog.deadline > now else due
@@ -246,7 +246,6 @@ class WriterThread:
             self._rewrite_due = False
             pause = self._limiter.pause_after(previous, shape) if previous is not None else 0.0
             self._write_at = now + pause
-            self._check_at = now + CHECK_PERIOD_S
             self._change.notify_all()
         self.counters.frames += 1
 

@@ -339,10 +339,26 @@ def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUni
         assert writer.enable(5)
 
 
-class Counting(Edac40Tcp):
-    """Counts how often the link was tried: at the second of two tries the first one has failed."""
+def test_a_unit_slower_than_the_limits_is_waited_for_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit) -> None:
+    class Slow(Edac40Tcp):
+        def _do_write(self, codes: np.ndarray, wired: np.ndarray) -> None:
+            time.sleep(0.03)
+            super()._do_write(codes, wired)
 
-    tries = 0
+    with running_writer(unit, electronics=Slow) as (writer, _told):
+        assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
+        assert writer.disable(0.2) is Outcome.REACHED
+        wait_until(lambda: signals_of(unit.frames[-1:]) == pytest.approx(-1.0, abs=CODE))
+
+
+class Counting(Edac40Tcp):
+    """Counts how often the link was looked at, and tried: at the second of two tries the first one has failed."""
+
+    tries = checks = 0
+
+    def _do_check(self) -> None:
+        self.checks += 1
+        super()._do_check()
 
     def _do_open(self) -> None:
         self.tries += 1
@@ -410,6 +426,19 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
             assert writer.state().moving is None
             wait_until(lambda: len(unit.frames) > frames)
             assert signals_of(unit.frames[-1:]) == pytest.approx(lost.applied[0], abs=CODE)
+
+
+def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=2.0, electronics=Counting) as (writer, _told):
+        electronics = writer._electronics
+        assert isinstance(electronics, Counting)
+        before, frames = electronics.checks, writer.counters.frames
+        assert writer.command(shape(0.2)).wait(5) is Outcome.REACHED
+        for number in range(8):
+            time.sleep(0.1)
+            writer.command(shape(0.2 + 0.01 * (number % 2)))
+        # One look belongs to each frame.
+        assert electronics.checks - before - (writer.counters.frames - frames) >= 4
 
 
 def test_disable_without_a_link_says_so(unit: Edac40TcpUnit) -> None:

@@ -104,3 +104,5 @@ def test_discovery_over_the_loopback(capsys: pytest.CaptureFixture[str]) -> None
         unit.unplug()
         assert discover.main(["--address", "127.0.0.1", "--port", str(port), "--timeout", "0.05"]) == 1
         assert "no EDAC40 answered" in capsys.readouterr().err
+        assert discover.main(["--address", "192.168..5"]) == 1
+        assert "discovery failed at 192.168..5:30303" in capsys.readouterr().err

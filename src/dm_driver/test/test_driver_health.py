@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.lifecycle import ERROR, OK, WARN
 from dm_driver.driver_health import driver_health
 
@@ -26,3 +27,9 @@ def test_health_is_good_only_where_nothing_is_missing(changed: dict[str, Any], l
     writer: Any = SimpleNamespace(state=lambda: SimpleNamespace(**state), counters=counters)
     health = driver_health(writer, None, {})
     assert health.level == level and words in health.message
+
+
+def test_a_command_does_not_hide_why_the_configuration_was_refused() -> None:
+    refused = Refusal(ErrorCode.DRIVER_INACTIVE, "the driver is not configured")
+    health = driver_health(None, refused, {"DRIVER_INACTIVE": 1}, "volts.max = 900 V")
+    assert health.level == ERROR and health.message == "volts.max = 900 V"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -170,6 +172,19 @@ class TestContract:
     def test_a_missing_setting_is_named(self, unit: DriveUnit) -> None:
         with pytest.raises(ValueError, match=r"electronics\.(address|serial_port) is empty"):
             make_electronics(unit.kind, ElectronicsSettings())
+
+
+def test_what_a_makers_library_raises_breaks_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    def apply_pattern(_pattern: np.ndarray) -> None:
+        raise RuntimeError("overheated")
+
+    mirror = SimpleNamespace(n_actuators=CHANNELS, apply_pattern=apply_pattern, _pyroRelease=lambda: None)
+    pyro = SimpleNamespace(Proxy=lambda _address: mirror, errors=SimpleNamespace(PyroError=OSError))
+    monkeypatch.setitem(sys.modules, "Pyro4", pyro)
+    with make_electronics("microscope", ElectronicsSettings("PYRO:Mirror@127.0.0.1:8000")) as electronics:
+        with pytest.raises(LinkError, match="overheated"):
+            electronics.write(*random_frame(electronics, 1))
+        assert not electronics.is_open
 
 
 def test_unknown_back_end_is_refused_with_the_known_ones() -> None:

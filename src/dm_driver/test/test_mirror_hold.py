@@ -84,6 +84,10 @@ def test_who_lost_it_does_not_get_it_back_by_renewing(hold: MirrorHold) -> None:
         hold.ask(Operation.RENEW, "calibration")
     hold.ask(Operation.RELEASE, "operator")
     assert hold.holder == ""
+    hold.ask(Operation.HOLD, "autofocus")
+    hold.evict("")  # what somebody else loses gives nothing back
+    with refused(ErrorCode.PREEMPTED):
+        hold.ask(Operation.RENEW, "calibration")
 
 
 def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) -> None:

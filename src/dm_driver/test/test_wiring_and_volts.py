@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from dm_msgs.msg import ActuatorState
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dm_driver.commands.mirror_hold import MirrorHold
+from dm_driver.driver_messages import state_message
+from dm_driver.moves import Kind, WriterState
 from dm_driver.output.volts import LAWS, VoltScale
 from dm_driver.output.wiring import TABLES, OutputStage, wiring_table
+from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))
@@ -56,6 +62,14 @@ def test_custom_wiring_with_an_unconnected_actuator() -> None:
     signals, volts = stage.outcome(codes)
     assert signals == pytest.approx([1, -1, 0], abs=2e-5)
     assert volts == pytest.approx([300, 0, 150], abs=3e-3)
+    # What it was asked for it never reaches, and where it rests is no limit of the signals.
+    limiter = SafetyLimiter(DriverLimits(actuators=3, low=-0.5))
+    configuration: Any = SimpleNamespace(output=stage, limiter=limiter, electronics=SimpleNamespace(knows_volts=True))
+    asked = np.array([0.5, 0.5, 0.0])
+    moving = WriterState(True, True, Kind.COMMAND, asked, signals, volts, 0, 1, True, 0, 0, None, "")
+    state = state_message(moving, None, configuration, "mirror", MirrorHold(lambda: 0.0))
+    on_its_way = ActuatorState.FLAG_RAMPING | ActuatorState.FLAG_AT_LIMIT
+    assert list(state.flags) == [on_its_way, ActuatorState.FLAG_UNUSED, 0]
 
 
 def test_vendor_rule_when_the_range_is_the_whole_dac() -> None:

@@ -15,6 +15,7 @@ from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
 from dm_calibration.acquisition.inotify import ClosedFiles
 from dm_calibration.acquisition.trigger import PLACEHOLDER, run_trigger
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
+from dm_calibration.map_files.datx_structure import as_text
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.values import parameter, real, text, texts
@@ -120,11 +121,12 @@ class Acquisition:
 
     def start(self) -> None:
         """Begin to watch; what is in the folder now is not new."""
-        self._stop.clear()
+        self._stop = threading.Event()  # a thread that is late to end still sees that of its own time
         if self.settings.folder is not None:
             self._watch = FolderWatch(self.settings.folder, self.settings.patterns, self.settings.stable_time)
             self._poll(self._watch)
-            self._thread = threading.Thread(target=self._run, args=(self._watch,), name="folder_watch", daemon=True)
+            watched = self._watch, self._stop
+            self._thread = threading.Thread(target=self._run, args=watched, name="folder_watch", daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
@@ -234,11 +236,11 @@ class Acquisition:
                     reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
                     raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
 
-    def _run(self, watch: FolderWatch) -> None:
+    def _run(self, watch: FolderWatch, stop: threading.Event) -> None:
         period = min(max(self.settings.stable_time / 4, 0.02), 0.25)
         due = time.monotonic() + period
         with closing(ClosedFiles(watch.folder)) as closed:
-            while not self._stop.is_set():
+            while not stop.is_set():
                 names = closed.wait(due - time.monotonic())
                 events = watch.closed(names, time.monotonic())
                 if time.monotonic() >= due:
@@ -246,7 +248,7 @@ class Acquisition:
                     due = time.monotonic() + period
                 for event in events:
                     if event.refused:
-                        self._on_trouble(f"{event.path}: {event.refused}")
+                        self._on_trouble(f"{as_text(event.path)}: {event.refused}")
                     else:
                         self._hand_over(event)
 

@@ -139,7 +139,7 @@ class Ingest:
             try:
                 return self._measure(source, settings)
             except (InsufficientDataError, MapRejectedError) as error:
-                raise type(error)(f"{path}: {error}") from error
+                raise type(error)(f"{source.file}: {error}") from error
 
     def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         """Orient and fit a map that was read. Raises as :meth:`read`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from dm_calibration.map_files import dat
 from dm_calibration.map_files.dat import is_dat, parse_dat
 from dm_calibration.map_files.datx import is_datx
-from dm_calibration.map_files.datx_structure import check_end
+from dm_calibration.map_files.datx_structure import as_text, check_end
 from dm_calibration.map_files.fits import is_fits, parse_fits
 from dm_calibration.map_files.surface_map import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_calibration.map_files.text_maps import XYZ_TITLE, XYZ_UNITS, is_text, parse_asc, parse_xyz
@@ -37,16 +37,17 @@ def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> Su
         NoValidPixelsError: whole, but without a valid pixel.
     """
     path = Path(path)
+    name = as_text(path)  # a name that is no UTF-8 goes into no message
     if "\0" in str(path):
         raise MapFileError(f"path = {str(path)!r}: must not contain a NUL character")
     try:
         content = _read(path)
         surface_map = _parse(content, path.suffix.lower(), xyz_unit)
     except OSError as error:
-        raise MapFileError(f"{path}: {error.strerror or error}") from error
+        raise MapFileError(f"{name}: {error.strerror or error}") from error
     except MapFileError as error:
-        raise type(error)(f"{path}: {error}") from error
-    return dataclasses.replace(surface_map, file=str(path), content=content)
+        raise type(error)(f"{name}: {error}") from error
+    return dataclasses.replace(surface_map, file=name, content=content)
 
 
 def is_complete(path: Path) -> bool:

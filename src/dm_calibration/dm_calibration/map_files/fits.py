@@ -55,8 +55,9 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
     if "CHECKSUM" in header and int(np.frombuffer(content[:end], ">u4").sum(dtype=np.uint64)) % 0xFFFFFFFF:
         raise MapFileError("CHECKSUM does not agree with the content: the file is damaged")
     stored = np.frombuffer(content, kind, width * height, start).reshape(height, width)[::-1]  # row 1 = bottom
-    metres = _unit(str(header.get("BUNIT", "")) or unit)
-    sag = stored * (_real(header, "BSCALE", 1.0) * metres) + _real(header, "BZERO", 0.0) * metres
+    told = str(header.get("BUNIT", ""))
+    metres = _unit(told, "BUNIT") if told or not unit else _unit(unit, "xyz_unit")
+    sag = stored.astype(np.float64) * (_real(header, "BSCALE", 1.0) * metres) + _real(header, "BZERO", 0.0) * metres
     if stored.dtype.kind != "f" and "BLANK" in header:
         sag[stored == header["BLANK"]] = math.nan
     sag[~np.isfinite(sag)] = math.nan
@@ -139,7 +140,7 @@ def _real(header: Header, name: str, otherwise: float) -> float:
     return float(value)
 
 
-def _unit(text: str | None, name: str = "BUNIT") -> float:
+def _unit(text: str, name: str) -> float:
     """m per unit."""
     if not text:
         raise MapFileError(f"{name} is missing: the values have no unit; xyz_unit of the interferometer may tell it")

@@ -59,7 +59,7 @@ class SurfaceMap:
         wavelength: m.
         pitch: m per pixel; None when the file does not know it.
         origin: column and row of the map's top left pixel on the camera.
-        format: "dat", "asc", "xyz" or "datx".
+        format: "dat", "asc", "xyz", "datx", "fits", "h5" or "4D"; "array" or "zernike" of no file.
         instrument: software and system type, as told by the file.
         serial: serial number of the instrument; "" when not known.
         time_stamp: Unix time of the measurement, s; None when not known.

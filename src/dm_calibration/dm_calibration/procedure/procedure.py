@@ -204,14 +204,16 @@ class Procedure:
         Its time is not known; it counts as right after the map before.
         """
         records = self.outcome.records
-        if not (step.in_use or step.kind in (StepKind.EXCITATION, StepKind.DEGAUSSED)) or not records:
+        if self._plan.kind is not PlanKind.HYSTERESIS or not records:
             return
+        # A reference frame without a map is a command like others: no figure is followed from it, no bump judged by it.
+        kind = StepKind.EXCITATION if step.kind is StepKind.REFERENCE else step.kind
         nothing = np.full_like(records[-1].coefficients, np.nan)
         assert step.signals is not None
         unseen = replace(
             records[-1],
             label=step.label,
-            kind=step.kind.value,
+            kind=kind.value,
             step=number,
             signals=step.signals,
             applied=applied,

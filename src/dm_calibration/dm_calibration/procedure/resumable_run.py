@@ -107,7 +107,7 @@ def open_run(
     Raises:
         StoreError: the journal cannot be written, or there is no room for all maps.
     """
-    notes = [f"unfinished run {text}: it waits for its own goal" for text in runs.others(identity)]
+    notes = [f"unfinished run {text}" for text in runs.others(identity)]
     chosen: Kept | None = None
     for found in runs.find(identity, plan.remarks):
         reason = "a newer one goes on" if chosen else _reason_against(found, plan, options)
@@ -116,24 +116,21 @@ def open_run(
             continue
         runs.set_aside(found.folder)
         notes.append(f"unfinished run {found.folder.name} ({found.maps} maps) is set aside: {reason}")
-    notes += [f"{name} deleted: too many unfinished runs" for name in runs.prune()]
-    missing = ROOM_PER_MAP * len(plan.steps) * maps_per_state
+    notes += [f"{name} deleted: too many unfinished runs" for name in runs.prune(chosen.folder if chosen else None)]
+    about = {"software_version": software_version(), "created_ns": time.time_ns(), "note": note}
+    journal = RunJournal.reopen(chosen.folder) if chosen else runs.begin(identity, about)
+    try:
+        journal.check_room(ROOM_PER_MAP * len(plan.steps) * maps_per_state)
+    except StoreError:
+        (journal.close if chosen else journal.remove)()
+        raise
     if chosen is None:
-        about = {"software_version": software_version(), "created_ns": time.time_ns(), "note": note}
-        journal = runs.begin(identity, about)
-        try:
-            journal.check_room(missing)
-        except StoreError:
-            journal.remove()
-            raise
         return OpenRun(journal, Outcome(remarks=list(plan.remarks)), notes=tuple(notes))
     if chosen.torn:
         notes.append(
             f"unfinished run {chosen.folder.name}: the last {chosen.torn} bytes are not whole and do not count"
         )
     text = f"resumed run {chosen.folder.name} with {len(chosen.outcome.records)} maps"
-    journal = RunJournal.reopen(chosen.folder)
-    journal.check_room(missing)
     return OpenRun(journal, chosen.outcome, chosen.storing, text, tuple(notes))
 
 

@@ -93,17 +93,19 @@ class UnfinishedRuns:
         return sorted(found, key=lambda run: (run.last_ns, run.folder.name), reverse=True)
 
     def others(self, identity: Mapping[str, Any]) -> list[str]:
-        """Each unfinished run that a goal with `identity` does not go on with, and why."""
+        """Each unfinished run that a goal with `identity` cannot go on with, and why."""
         sentences = []
         for folder in self._runs():
             try:
                 theirs = read_manifest(folder)["identity"]
+                if theirs == identity:
+                    read_run(folder)
             except (JournalError, KeyError) as error:
                 sentences.append(f"{folder.name}: {error}")
                 continue
             if theirs != identity:
                 differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
-                sentences.append(f"{folder.name}: other {', '.join(differing)}")
+                sentences.append(f"{folder.name}: other {', '.join(differing)}: it waits for its own goal")
         return sentences
 
     def set_aside(self, folder: Path) -> Path:
@@ -116,10 +118,11 @@ class UnfinishedRuns:
         with storing(f"run {folder.name} cannot be set aside"):
             return folder.rename(target)
 
-    def prune(self) -> list[str]:
-        """Delete the oldest of too many runs; returns their names."""
+    def prune(self, going_on: Path | None = None) -> list[str]:
+        """Delete the oldest of too many runs, but not the one that is `going_on`; returns their names."""
         aside = sorted(self.folder.glob(f"*{ASIDE}"), reverse=True)
-        removed = aside[ASIDE_MAX:] + sorted(self._runs(), reverse=True)[WAITING_MAX:]
+        waiting = sorted(self._runs(), reverse=True)[WAITING_MAX:]
+        removed = aside[ASIDE_MAX:] + [folder for folder in waiting if folder != going_on]
         for folder in removed:
             with suppress(OSError):
                 shutil.rmtree(folder)

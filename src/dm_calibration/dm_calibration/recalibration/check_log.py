@@ -46,11 +46,13 @@ class Check:
 
 def append_check(file: Path, check: Check) -> None:
     """Add a line to the log. Raises OSError."""
-    new = not file.exists()
+    end = file.read_bytes()[-1:] if file.exists() else b""
     with file.open("a", newline="") as stream:
         writer = csv.writer(stream)
-        if new:
+        if not end:
             writer.writerow(item.name for item in fields(Check))
+        elif end != b"\n":  # a power cut has torn the last line
+            writer.writerow(())
         writer.writerow(astuple(check))
 
 

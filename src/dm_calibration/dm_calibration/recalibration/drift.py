@@ -57,6 +57,7 @@ class Drift:
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
         surprising: maps in a row, the last ones, that disagreed.
+        disagreement: largest error (m) that these have shown, or that actuators they show make elsewhere.
         evidence: (2, 2) sum of squares of the changes that were predicted of maps, in standard deviations, and of their
             products with the changes that the maps showed; then the same of the changes by temperature alone.
         stuck: (N,) effective signals at which actuators stand that do not move any more; NaN = it moves.
@@ -75,6 +76,7 @@ class Drift:
     revision: int = 0
     checked_ns: int = 0
     surprising: int = 0
+    disagreement: float = 0.0
 
     @property
     def trust(self) -> float:

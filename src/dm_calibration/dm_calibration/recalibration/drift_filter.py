@@ -170,6 +170,7 @@ class DriftFilter:
             revision=drift.revision + 1,
             checked_ns=stamp_ns,
             surprising=0,
+            disagreement=0.0,
             evidence=evidence,
             temperatures=np.array(
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
@@ -199,7 +200,7 @@ class DriftFilter:
         at = drift.reached(effective)
         stuck = drift.stuck.copy()
         for actuator, more, error in zip(actuators, away, sigma, strict=True):
-            if np.isnan(stuck[actuator]) and abs(more) < DISPLACED_SIGMAS * error:
+            if np.isnan(stuck[actuator]) and abs(more) <= DISPLACED_SIGMAS * error:
                 raise MapNotUsableError(
                     f"actuator {actuator + 1} stands at {at[actuator] + more:+.2f} +- {error:.2f}, and should at "
                     f"{at[actuator]:+.2f}: this shape does not show that it fails; ask for another first"

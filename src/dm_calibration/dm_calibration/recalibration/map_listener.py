@@ -23,7 +23,6 @@ from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_calibration.requests import UPDATE_CALIBRATION
 from dm_common.errors import EXPECTED, ErrorCode, Refusal
-from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import qos
@@ -67,7 +66,6 @@ class MapListener:
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self.history = AppliedHistory()  # what stood at the mirror, which the node forgets with it
-        self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
         self._exchange = threading.Lock()  # a map is compared by the law that its effective signals are of
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
@@ -90,21 +88,19 @@ class MapListener:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, calibration: Calibration | None) -> None:
-        """Keep `calibration` true from now on."""
+        """Keep `calibration` true from now on, and follow its hysteresis about the mid range of the mirror as it is."""
         kept = self._updates.in_use
-        if calibration is (kept and kept.calibration):
-            return
         middle = float(mirror.rest[0]) if (mirror := self._manager.mirror) is not None else 0.0
         law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
         with self._exchange:
+            self.history.follow(law, middle)
+            if calibration is (kept and kept.calibration):
+                return
             self._updates.folder = self._manager.store.folder
             try:
                 remark = self._updates.begin(calibration)
             except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
                 remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
-            if law is not self._law:  # recipes may have been added to the same calibration
-                self._law = law
-                self.history.follow(law, middle)
         if remark:
             self._node.get_logger().warning(remark)
 
@@ -118,7 +114,7 @@ class MapListener:
     def recipes_in_doubt(self) -> bool:
         """Whether the mirror goes on without some actuators, or maps disagree: recipes are of what it was."""
         kept = self._updates.in_use
-        return kept is not None and bool(kept.drift.given_up or kept.drift.surprising or kept.disagreement)
+        return kept is not None and bool(kept.drift.given_up or kept.drift.surprising)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""

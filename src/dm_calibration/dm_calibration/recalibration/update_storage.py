@@ -18,7 +18,7 @@ SCHEMA_VERSION = 1
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
-_EVIDENCE = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0}
+_FIGURES = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0, "disagreement": 0.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
@@ -46,7 +46,7 @@ def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> No
         "calibration": identifier,
         "basis_sha256": basis,
         **{name: getattr(updates, name) for name in _NUMBERS},
-        **dict(zip(_EVIDENCE, updates.evidence.ravel().tolist(), strict=True)),
+        **dict(zip(_FIGURES, (*updates.evidence.ravel().tolist(), updates.disagreement), strict=True)),
     }
     write_whole(path, write_image(columns, attributes))
 
@@ -90,9 +90,9 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or np.isinf(value).any():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} numbers, NaN where {meaning}")
-    evidence = {name: attributes.get(name, before) for name, before in _EVIDENCE.items()}
-    for name, number in evidence.items():
+    figures = {name: attributes.get(name, before) for name, before in _FIGURES.items()}
+    for name, number in figures.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers}
-    return Drift(**found, evidence=np.reshape(list(evidence.values()), (2, 2)))
+    found: dict[str, Any] = {**arrays, **numbers, "disagreement": figures.pop("disagreement")}
+    return Drift(**found, evidence=np.reshape(list(figures.values()), (2, 2)))

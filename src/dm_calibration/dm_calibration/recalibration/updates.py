@@ -80,8 +80,6 @@ class InUse:
         basis: hash of what updates change, see :func:`basis_hash`.
         repeats: maps that were taken of the present shape, which the mirror has had since `since` (s), the first of
             them at `first_ns`.
-        disagreement: largest error (m) that maps have shown since one agreed, or that actuators they show make
-            elsewhere.
     """
 
     calibration: Calibration
@@ -91,7 +89,6 @@ class InUse:
     repeats: int = 0
     since: float = float("nan")
     first_ns: int = 0
-    disagreement: float = 0.0
 
     def changed_fit(self, temperature: float = math.nan) -> InfluenceFit:
         """The influence function as maps have found it, at `temperature` (degC)."""
@@ -106,7 +103,7 @@ class RecalibrationManager:
     """Updates of the calibration in use; every method may be called from any thread.
 
     Args:
-        options: asked for at every map; its rates and signal_sigma at every new calibration.
+        options: asked for at every map.
 
     Attributes:
         in_use: None without a calibration; replaced as a whole.
@@ -195,12 +192,12 @@ class RecalibrationManager:
             if dry_run:
                 return Verdict(accepted, reason, comparison)
             if accepted:
-                changed, kept = comparison.updated, replace(kept, disagreement=0.0, repeats=repeat + 1)
+                changed, kept = comparison.updated, replace(kept, repeats=repeat + 1)
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
             else:
-                changed = replace(kept.drift, surprising=kept.drift.surprising + 1)
-                kept = replace(kept, disagreement=max(kept.disagreement, worst))
+                worst = max(kept.drift.disagreement, worst)
+                changed = replace(kept.drift, surprising=kept.drift.surprising + 1, disagreement=worst)
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration.id, kept.basis, changed)
             self.in_use = replace(kept, drift=changed)
@@ -291,4 +288,5 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             f"{seen:.1%} of the sampled area has data: must be at least {options.valid_fraction_min:.1%}"
         )
     if measured.stamp_ns <= calibration.stamp_ns:
-        raise MapNotUsableError("measured before the calibration was finished, by its stamp")
+        early = 1e-9 * (calibration.stamp_ns - measured.stamp_ns)
+        raise MapNotUsableError(f"stamp {early:.3f} s before the calibration was finished: must be after that")

@@ -45,8 +45,10 @@ def valid_until(
     per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
     if low <= 0.0:
         return stale, f"no growth of the error beyond chance ({per_month}); a check that agrees puts it off"
-    reached = float(time[0] + max(promised - level, 0.0) / slope)
-    return min(stale, max(reached, float(time[-1]))), f"the error grows by {per_month} and reaches the promise then"
+    reached = max(float(time[0] + max(promised - level, 0.0) / slope), float(time[-1]))
+    if reached > stale:
+        return stale, f"the error grows by {per_month}, within the promise until then; a check that agrees puts it off"
+    return reached, f"the error grows by {per_month} and reaches the promise then"
 
 
 def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = DEFAULTS) -> Section:

@@ -133,7 +133,10 @@ class CalibrationStore:
         Raises:
             UnknownNameError: no such file, or a name that leads out of the folder.
         """
-        path = Path(name).expanduser()
+        try:
+            path = Path(name).expanduser()
+        except RuntimeError as error:
+            raise UnknownNameError(f"calibration {name!r}: {error}") from error
         if path.name != name:  # a path: only one that is a file of this folder
             inside = path.suffix == SUFFIX and path.parent.resolve() == self.folder.resolve()
             if not inside:

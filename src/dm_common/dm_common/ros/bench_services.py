@@ -229,7 +229,7 @@ class BenchServices:
         node = Node(f"{self._node.get_name()}_exit", context=context, use_global_arguments=False)
         executor = SingleThreadedExecutor(context=context)
         try:
-            client = node.create_client(SetSignals, self._set_signals.srv_name)
+            client = node.create_client(SetSignals, self._set_signals.service_name)  # of this namespace, as remapped
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
                 return "the mirror could NOT be brought back to mid range: the driver does not answer"

@@ -123,6 +123,8 @@ class ManagedNode(LifecycleNode):
         """The reason why it serves no requests and what to do, as a sentence; "" = it does."""
         if self.active:
             return ""
+        if self._state_machine.current_state[1] in ("shuttingdown", "finalized"):
+            return f"{self.get_name()} was shut down: start its process again"
         name, trouble = self.get_fully_qualified_name(), f" ({self._trouble})" if self._trouble else ""
         steps = "activate" if self.configured else "configure`, then `activate"
         return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"

@@ -14,7 +14,7 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
@@ -27,7 +27,6 @@ from dm_common.values import Fields, without_figures
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
-
 #: Longest wait for a simulator's first message on /clock, s.
 CLOCK_S = 10.0
 #: Of requests that hold nothing that could be wrong, or are checked by whoever takes them.
@@ -36,8 +35,7 @@ NO_FIELDS = Fields({})
 
 def _check_active(node: Node) -> None:
     """Raise Refusal when a lifecycle node rests, see `dm_common.ros.lifecycle.ManagedNode`."""
-    if (check := getattr(node, "check_active", None)) is not None:
-        check()
+    getattr(node, "check_active", lambda: None)()
 
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
@@ -283,18 +281,20 @@ def wait_for_clock(clock: Clock) -> None:
 
 
 def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
-    """Sleep in ROS time (which may run faster than the wall clock) in a worker thread.
+    """Sleep in a worker thread; in ROS time where that is simulated, which may run fast, or begin anew meanwhile.
 
     Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
     raises ClockError after 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
-    end = clock.now() + Duration(nanoseconds=round(seconds * 1e9))
+    ticking = clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)  # the other may be set
+    end = ticking.now() + (whole := Duration(nanoseconds=round(seconds * 1e9)))
     give_up = time.monotonic() + 10.0 + 10.0 * seconds
-    while (remaining := (end - clock.now()).nanoseconds * 1e-9) > 0:
+    while (remaining := (end - ticking.now()).nanoseconds * 1e-9) > 0:
         if cancelled():
             return False
         if time.monotonic() > give_up:
             raise ClockError(f"ROS time did not advance by {seconds:g} s; is the publisher of /clock alive?")
-        time.sleep(min(remaining, 0.002 if remaining < 0.02 or clock.ros_time_is_active else 0.02))
+        time.sleep(min(remaining, 0.002 if remaining < 0.02 or ticking is clock else 0.02))
+        end = min(end, ticking.now() + whole)
     return not cancelled()

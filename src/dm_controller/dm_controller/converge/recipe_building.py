@@ -163,7 +163,6 @@ class RecipeBuilder:
             rms=rms_sag(error, self._loop.mirror.model),
             maps=maps,
             zernike=taken.target.zernike,
-            by_model=self._loop.mirror.command(taken.target)[0],
         )
 
     def _error(self, taken: _Round) -> Shape:
@@ -252,10 +251,17 @@ def recipe_book(
 ) -> RecipeBook:
     """Recipes of one run as a book; its figures are of the whole that they make with those there were `before`.
 
+    Args:
+        loop: of the calibration as it is now: their own maps may have been taken into it while they were built.
+
     Raises:
         RecipeError: those were made under another condition.
     """
-    ordered = sorted(recipes, key=lambda recipe: recipe.shape)
+    shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
+    known = [
+        replace(recipe, by_model=loop.mirror.command(shape)[0]) for recipe, shape in zip(recipes, shapes, strict=True)
+    ]
+    ordered = sorted(known, key=lambda recipe: recipe.shape)
     book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
     whole = before.merged(book)
     between = Corrections(whole, loop).worst - max(recipe.max_zernike for recipe in whole.recipes)

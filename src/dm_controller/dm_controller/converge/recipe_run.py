@@ -5,6 +5,7 @@ The mirror goes back to mid range.
 """
 
 import time
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from dm_msgs.action import BuildRecipes
 from dm_msgs.srv import StoreRecipes
 from rclpy.client import Client
 
-from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
+from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
@@ -23,6 +24,8 @@ from dm_common.ros.worker import WorkerGoal
 from dm_common.values import without_figures
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import recipe_targets
 from dm_controller.planning.target import FocusTarget
 
@@ -94,7 +97,8 @@ class RecipeRun:
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
-            book = recipe_book(recipes, planner, steps, round(1e9 * bench.now()), active.recipes)
+            now = self._planner_now(active)
+            book = recipe_book(recipes, now, steps, round(1e9 * bench.now()), active.recipes)
             result.interpolation_error = book.interpolation_error
             request = StoreRecipes.Request(recipes=recipe_book_message(book, calibration.id))
             stored, reason = self._stored(handle, request)
@@ -115,6 +119,14 @@ class RecipeRun:
             else "no recipe was stored"
         )
         return code, "; ".join(filter(None, (text, figures, rest)))
+
+    def _planner_now(self, active: ActiveCalibration) -> Planner:
+        """By the calibration of these recipes, into which their maps may have been taken meanwhile."""
+        with suppress(Refusal):
+            now = self._bench.active_calibration()
+            if now.calibration.id == active.calibration.id:
+                return now.planner
+        return active.planner
 
     def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[int, str]:
         """Build all; those that are whole stay when the next fails. Returns an ErrorCode and a sentence."""

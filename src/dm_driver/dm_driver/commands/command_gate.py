@@ -33,6 +33,7 @@ class CommandGate:
     Attributes:
         writer, configuration: of the configured driver; None = it is not.
         refusal: of the last command, or of the configuration; None = it was carried out.
+        trouble: why the configuration was refused; "" = it was not.
         refused: number of refused commands by the name of their code.
     """
 
@@ -41,6 +42,7 @@ class CommandGate:
         self.writer: ActuatorWriter | None = None
         self.configuration: DriverConfiguration | None = None
         self.refusal: Refusal | None = None
+        self.trouble = ""
         self.refused: Counter[str] = Counter()
 
     def attempt(
@@ -62,9 +64,8 @@ class CommandGate:
             self.refusal = None  # before the writer's thread publishes the first write
         try:
             if writer is None or configuration is None:
-                raise Refusal(
-                    ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
-                )
+                reason = self.trouble or "configure and activate it first"
+                raise Refusal(ErrorCode.DRIVER_INACTIVE, f"the driver is not configured: {reason}")
             TEXT.check("holder", request.holder)
             takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
             result = carry_out(writer, configuration)

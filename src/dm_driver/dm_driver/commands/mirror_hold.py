@@ -41,7 +41,7 @@ class MirrorHold:
         # The holder stays until somebody else moves the mirror, also when the lease has run out: see `_current`.
         self._holder = self._purpose = ""
         self._since = self._until = self._duration = 0.0
-        self._evicted = self._evicted_by = ""  # whose hold was taken over last, and by whom
+        self._evicted: dict[str, str] = {}  # whose hold was taken over and by whom, until they hold it again
 
     @property
     def holder(self) -> str:
@@ -79,8 +79,7 @@ class MirrorHold:
                     self._holder = ""
                 return
             self._evict(holder, holder)
-            if holder == self._evicted:
-                self._evicted = ""
+            self._evicted.pop(holder, None)
             now = self._clock()
             if current != holder:
                 self._since = now
@@ -110,8 +109,8 @@ class MirrorHold:
             self._evict(by, by or ("a command with take_over" if self._current() else "a command"))
 
     def _check_evicted(self, holder: str) -> None:
-        if holder and holder == self._evicted:
-            raise Refusal(ErrorCode.PREEMPTED, f"{self._evicted_by} has taken the mirror over")
+        if by := self._evicted.get(holder):
+            raise Refusal(ErrorCode.PREEMPTED, f"{by} has taken the mirror over")
 
     def _current(self) -> str:
         return self._holder if self._clock() <= self._until else ""
@@ -119,7 +118,7 @@ class MirrorHold:
     def _evict(self, holder: str, by: str) -> None:
         """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
         if self._holder not in ("", holder):
-            self._evicted, self._evicted_by, self._holder = self._holder, by, ""
+            self._evicted[self._holder], self._holder = by, ""
 
     def _sentence(self) -> str:
         if not self._current():

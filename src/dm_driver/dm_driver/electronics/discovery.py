@@ -42,7 +42,10 @@ class Probe:
     """A socket that asks and collects answers; the two are apart so that asking never waits."""
 
     def __init__(self, address: str, port: int = PORT) -> None:
-        self._destination = (socket.gethostbyname(address), port)
+        try:
+            self._destination = (socket.gethostbyname(address), port)
+        except UnicodeError as error:  # no name can be like that
+            raise OSError(f"{address}: {error}") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._socket.setblocking(False)

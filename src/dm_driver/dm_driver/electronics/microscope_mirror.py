@@ -40,7 +40,6 @@ class MicroscopeMirror(DriveElectronics):
             raise LinkError(
                 "python-microscope needs the package Pyro4: ./dm exec python -m pip install Pyro4"
             ) from error
-        self._errors: tuple[type[Exception], ...] = (Pyro4.errors.PyroError,)
         self._link = self._asked(lambda: Pyro4.Proxy(self._settings.address))
         self._link._pyroSerializer, self._link._pyroTimeout = "pickle", self._timeout_s
         actuators = self._asked(lambda: self._link.n_actuators)
@@ -61,8 +60,10 @@ class MicroscopeMirror(DriveElectronics):
             link._pyroRelease()
 
     def _asked(self, call: Callable[[], Any]) -> Any:
-        """The answer of `call`; what fails there breaks the link, for the outputs are not known then."""
+        """The answer of `call`; what fails there, the maker's library included, breaks the link: the outputs are not
+        known then.
+        """
         try:
             return call()
-        except self._errors as error:
+        except Exception as error:
             raise LinkError(str(error)) from error

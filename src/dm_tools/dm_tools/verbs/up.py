@@ -198,7 +198,7 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
         raise ValueError(f"--config: {len(files)} files for {len(names)} mirrors; give one for each --namespace")
     result = {}
     for number, name in enumerate(names):
-        configuration = load_config(files[number] if files else shared_config("bench.yaml"))
+        configuration = load_config(files[number] if files else shared_config("bench.yaml"), name)
         if "pdm_driver" not in configuration:
             raise ValueError(f"{files[number]}: no section for pdm_driver: its required parameters must be given")
         if (unset := own_values(configuration)) is not None:
