@@ -57,6 +57,28 @@ def test_an_amplitude_of_pokes_is_for_plans_with_pokes(plan: tuple[str, ...]) ->
     assert found.exit_code == 2 and "--amplitude: must be a plan with pokes" in found.output.replace("\n", " ")
 
 
+@pytest.mark.parametrize(
+    "options", [("--plan", "pokes"), ("--settle", "3"), ("--maps-per-state", "2"), ("--no-activate",)]
+)
+def test_the_axis_of_a_camera_is_no_calibration(options: tuple[str, ...]) -> None:
+    refused = CliRunner().invoke(cli.app, ["calibrate", "--boresight", *options])
+    assert refused.exit_code == 2 and "--boresight takes no option of a calibration" in refused.output
+    refused = CliRunner().invoke(cli.app, ["calibrate", "--region", "0,0,1,1"])
+    assert refused.exit_code == 2 and "are for --boresight" in refused.output
+
+
+def test_a_fresh_start_that_was_interrupted_is_not_left_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_client: Any, _goal: Any) -> str:
+        raise KeyboardInterrupt
+
+    held: list[bool] = []
+    monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(FakeClient(CalibrationMsg())))
+    monkeypatch.setattr(verb, "set_parameter", lambda _client, _node, _name, value: held.append(value))
+    monkeypatch.setattr(verb, "expected_run", interrupted)
+    CliRunner().invoke(cli.app, ["calibrate", "--fresh"])
+    assert held == [True, False]
+
+
 def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:
     target = tmp_path / "my_bench.yaml"
     write_parameters("", target, source_of(target, None, "virtual-1"))

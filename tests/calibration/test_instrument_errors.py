@@ -140,6 +140,10 @@ def test_tables_with_gaps_and_files_too_many_are_refused(tmp_path: Path) -> None
     with pytest.raises(ValueError, match="has no column row"):
         _table(table, "file", "row")
     assert _table(table, "file", "reference", "part", "degrees") == [["a.dat", "A", "B", "0"]]
+    for content in (b"\x88\x1b\x03\x6f", b"a" * 200_000):
+        (tmp_path / "map.dat").write_bytes(content)
+        with pytest.raises(ValueError, match=r"map\.dat: must be a table"):
+            _table(tmp_path / "map.dat", "column")
     for files in ((table, table, "--write", tmp_path / "flat.fits"), (table,)):
         refused = CliRunner().invoke(make_app(), ["instrument", "flats" if files[1:] else "grid", *map(str, files)])
         assert refused.exit_code == 2 and f"{len(files[:2])} files: must be" in " ".join(refused.output.split())

@@ -11,7 +11,9 @@ import pytest
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.report.checks import DEFAULTS
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_tools.verbs import report as verb
 from dm_tools.verbs.report import find_calibration, report
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
@@ -44,9 +46,15 @@ def test_the_newest_is_reported(store: CalibrationStore, tmp_path: Path) -> None
     assert Path(told["files"]["html"]).name == "newer.html" and Path(told["files"]["pdf"]).is_file()
 
 
-def test_an_id_or_a_file_anywhere_is_found(store: CalibrationStore, tmp_path: Path) -> None:
+def test_an_id_or_a_file_anywhere_is_found(
+    store: CalibrationStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert find_calibration("older", store)[0].id == "older"
     elsewhere = CalibrationStore(tmp_path)
+    in_use = store.find("newer"), DEFAULTS, ""
+    monkeypatch.setattr(verb, "running_calibration", lambda _namespace: in_use)  # its node has a folder of its own
+    report("older", tmp_path / "out", json=tmp_path / "figures.json")
+    assert json.loads((tmp_path / "figures.json").read_text())["id"] == "older"
     assert find_calibration(str(store.find("older")), elsewhere)[1] == store.find("older")
     with pytest.raises(ValueError, match="calibrate first"):
         find_calibration("", elsewhere)

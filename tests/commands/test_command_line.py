@@ -143,6 +143,15 @@ def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[st
     assert parsed("status", "--json", str(tmp_path / "f"))["json"] == tmp_path / "f"
     output.console.print("again")
     assert capsys.readouterr().out == "again\n"
+    assert parsed("status", "--json", "/dev/stdout")["json"] == output.STANDARD_OUTPUT
+
+
+def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    write_json(tmp_path / "pipe", {"length": 1})
+    assert (tmp_path / "pipe").is_fifo() and json.loads(os.read(reader, 100)) == {"length": 1}
+    os.close(reader)
 
 
 @pytest.mark.parametrize(
@@ -165,6 +174,18 @@ def test_exit_codes(
         cli.main()
     assert ended.value.code == code
     assert capsys.readouterr().err == f"{said}\n"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), typer.Abort()])
+def test_a_verb_that_is_interrupted_ends_with_130(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while it asks, and with a typer that knows no such status."""
+
+    def fails(_namespace: str) -> None:
+        raise error
+
+    monkeypatch.setattr(verb_status, "running_suite", fails)
+    done = CliRunner().invoke(cli.app, ["status"])
+    assert (done.exit_code, "error: interrupted" in done.output) == (130, True)
 
 
 def test_with_nothing_running_the_way_out_is_named_at_once(
@@ -256,6 +277,12 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
     os.utime(older / "b.h5", (0, 0))
     assert folder_with("b", (newer, older)) == older
     assert folder_with("", (older, newer)) == folder_with("d", (older, newer)) == newer
+
+
+@pytest.mark.parametrize("words", [("--hysteresis-maps", "10"), ("--camera", "--hysteresis-maps", "0")])
+def test_maps_that_a_demo_cannot_take_are_refused_before_it_begins(words: tuple[str, ...]) -> None:
+    refused = CliRunner().invoke(cli.app, ["demo", *words])
+    assert refused.exit_code == 2 and "--hysteresis-maps" in refused.output
 
 
 def test_its_nodes_run_as_those_of_launch_files(monkeypatch: pytest.MonkeyPatch) -> None:

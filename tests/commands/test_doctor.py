@@ -467,3 +467,11 @@ def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
     [(_name, run)] = doctor_bench.bench_checks(file)
     finding = run()
     assert finding is not None and "no node of that name; known: virtual_bench, pdm_driver" in finding.problem
+
+
+def test_of_a_file_for_two_mirrors_the_one_that_is_named_is_checked(tmp_path: Path) -> None:
+    file = tmp_path / "both.yaml"
+    file.write_text("".join(f"/{name}/pdm_driver: {{ros__parameters: {{{name}: 1}}}}\n" for name in ("left", "right")))
+    checks = dict(doctor_bench.bench_checks(file, "/right"))
+    found = checks["parameters"]()
+    assert found is not None and "right" in found.problem and "left" not in found.problem

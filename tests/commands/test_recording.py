@@ -47,6 +47,7 @@ from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
 from dm_common.messages import doubles, taken, time_message
 from dm_common.ros import qos
 from dm_tools.cli import make_app
+from dm_tools.output import NotRunningError
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagError, BagReader, BagWriter, Message, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 from dm_tools.recording.player import play, replayed
@@ -226,11 +227,15 @@ def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any
 def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
 ) -> None:
-    held = [message for message in run_and_bag[2].read() if message.topic.name != PARAMETER_EVENTS]
+    held = [
+        replace(message, topic=replace(message.topic, name=f"/left{message.topic.name}"))
+        for message in run_and_bag[2].read()
+        if message.topic.name != PARAMETER_EVENTS
+    ]
     write_rosbag2(tmp_path / "theirs", held, "mcap")
-    config = tmp_path / "bench.yaml"
-    config.write_text("/**/calibration: {ros__parameters: {poke_amplitude: 0.4}}\n")
-    figures = _again(BagReader(tmp_path / "theirs"), 0, "", None, config)
+    config, section = tmp_path / "bench.yaml", "/calibration: {ros__parameters: {poke_amplitude: 0."
+    config.write_text(f"/left{section}4}}}}\n/right{section}3}}}}\n")
+    figures = _again(BagReader(tmp_path / "theirs"), 0, "/left", None, config)
     assert figures["identical"] is True
 
 
@@ -432,6 +437,9 @@ def test_names_that_nobody_publishes_are_told(
         with nullcontext() if "/zernike" in counts else pytest.raises(RuntimeError, match="--topics names nothing"):
             record(folder, "zernik,zernike", duration=0.01)
         assert "not recorded /zernik: nobody published it" in capsys.readouterr().out
+    running.counts, running.unseen = {"/diagnostics": 9, "/rosout": 2}, []
+    with pytest.raises(NotRunningError, match="and namespace"):  # of another mirror's nodes
+        record(folder, namespace="lfet", duration=0.01)
 
 
 def test_a_failure_of_the_writer_is_told(

@@ -97,8 +97,9 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> UnknownNameError
     """The error for `name`, listing the known names nearest to it, or all of them when there are few."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=4, cutoff=0.5) or (names if len(names) <= 12 else [])
-    hint = f"; did you mean {', '.join(near)}?" if near else f"; known are {', '.join(names[:3])} to {names[-1]}"
-    return UnknownNameError(f"{what} {name!r} is unknown" + (hint if names else ""))
+    known_names = f"; known are {', '.join(names[:3])} to {names[-1]}" if names else ""
+    hint = f"; did you mean {', '.join(near)}?" if near else known_names
+    return UnknownNameError(f"{what} {name!r} is unknown{hint}")
 
 
 class ClockError(CodedError, TimeoutError):

@@ -187,9 +187,13 @@ def test_creep_goes_on_after_a_clock_that_ran_ahead_is_set_back() -> None:
 def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
     file = tmp_path / "mirror.creep.npz"
     assert read_record(file, 0.0) is None
-    file.write_bytes(b"PK\x03\x04 torn")
-    with pytest.raises(ValueError, match=r"mirror\.creep\.npz"):
-        read_record(file, 0.0)
+    write_record(file, AT_REST)
+    whole = file.read_bytes()
+    entry = whole.index(b"PK\x01\x02")
+    for torn in (b"PK\x03\x04 torn", whole[: entry + 10] + b"\x63" + whole[entry + 11 :]):  # of an unknown compression
+        file.write_bytes(torn)
+        with pytest.raises(ValueError, match=r"mirror\.creep\.npz"):
+            read_record(file, 0.0)
 
 
 def test_a_disk_that_fails_leaves_the_record_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,6 +233,7 @@ def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None
     assert record_file("", "a") is None
     assert record_file("~/.ros/focus_controller", "PDM 30/1") == Path("/var/ros/focus_controller/PDM-30-1.creep.npz")
     assert record_file("/srv", "..") == Path("/srv/mirror.creep.npz")
+    assert record_file("~/.ros_bench", "a") == Path("~/.ros_bench/a.creep.npz").expanduser()
 
 
 def test_another_mirror_begins_with_its_own_record_and_no_reports(tmp_path: Path) -> None:

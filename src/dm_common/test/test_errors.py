@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dm_msgs.msg import ErrorCode as Message
 
-from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal, UnknownNameError, error_code
+from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal, UnknownNameError, error_code, unknown_name
 
 
 def test_codes_are_those_of_the_interface() -> None:
@@ -19,3 +19,4 @@ def test_each_failure_has_its_code() -> None:
     assert error_code(Cancelled("cancelled")) == 500
     assert error_code(UnknownNameError("surface 'x' is unknown")) == 106
     assert error_code(ValueError("steps = 0")) == 107
+    assert str(unknown_name("map label", "p01", [])) == "map label 'p01' is unknown"

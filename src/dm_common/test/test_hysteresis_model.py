@@ -167,6 +167,7 @@ def test_a_duhem_operator_without_end_is_refused() -> None:
         ("play_weight", np.ones((2, 1)), "play_weight has the shape"),
         ("duhem_weight", np.nan, "duhem_weight"),
         ("creep_time", np.array([1.0, 0.0]), "creep_time"),
+        ("lag_spectrum", np.ones(1000), "lag_spectrum has the shape"),
     ],
 )
 def test_a_law_that_makes_no_sense_is_refused(field: str, value: object, words: str) -> None:

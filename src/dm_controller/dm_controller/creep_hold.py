@@ -26,7 +26,7 @@ from dm_controller.focus_types import Moment, Order, SendCommand
 PERIOD_S = 0.02
 #: A shape that needs no correction is checked again after this share of the time since the last command.
 CHECK_SHARE = 0.1
-#: Time for the driver to report a command as its own, s; after it another publisher has overtaken it.
+#: Time for the driver to report a command as its own, s, steady; after it another publisher has overtaken it.
 CONFIRM_S = 1.0
 
 
@@ -83,11 +83,11 @@ class CreepHold:
                 self.order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
-        """What the driver reports as its last request (N,): the hold ends when it is another's."""
+        """What the driver reports as its last request (N,) at `now` (s, steady): the hold ends when it is another's."""
         command = self.order.command if self.order is not None else None
         if command is None or same_signals(requested, command.signals):
             return
-        if command.confirmed or now - command.sent.time > CONFIRM_S:
+        if command.confirmed or now - command.sent.steady > CONFIRM_S:
             self.end("another command came")
 
     def command(

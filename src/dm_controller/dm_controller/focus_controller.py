@@ -115,7 +115,7 @@ class FocusController:
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
         elif self.hold.active and self.monitor.stood is None:
-            self.hold.driver_requested(report.requested, now.time)
+            self.hold.driver_requested(report.requested, now.steady)
         self._at_rest = None if report.moving else self.observer.estimate(now.time)
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)

@@ -575,8 +575,22 @@ def test_what_was_never_reported_is_known_no_better_than_after_the_first_report(
     never, _ = fresh.request(FocusRequest(curvature=0.02), bench.now, dry_run=True)
     first = Bench().ask(0.02, dry_run=True)
     assert move_of(never).plan.max_zernike_upper > 0.99 * move_of(first).plan.max_zernike_upper
-    degaussed = ActuatorEstimate(None, "not reported").after_degauss(LAW, ACTUATORS, 0.0, 0.0).state
+    degaussed = ActuatorEstimate(None, "not reported").after_degauss(LAW, ACTUATORS, 0.0, 0.0, 0.0).state
     assert degaussed is not None and (degaussed.crept_sigma == UNSEEN).all()
+
+
+def test_a_move_after_a_degauss_is_planned_as_it_will_be_made(bench: Bench) -> None:
+    """Creep follows the middle while the mirror is degaussed, not the shape before."""
+    bench.ask(0.02)
+    bench.wait(60.0, 0.1)
+    bench.history_known = False
+    bench.report()
+    planned = move_of(bench.ask(-0.01, time_budget=60.0))
+    took = planned.duration - 0.05
+    bench.time += took
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, took))
+    bench.degauss()
+    np.testing.assert_allclose(bench.commands[-1].signals, planned.signals, atol=2e-4)
 
 
 def test_an_unknown_history_is_bounded_where_all_actuators_come_from_the_same_side() -> None:
@@ -904,6 +918,17 @@ def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) ->
     assert bench.error(move_of(order).effective) < 1e-4
     told = health(bench.controller, VALUES, bench.now).values
     assert (told["curvature"], told["held"]) == (0.02, True)
+
+
+def test_a_clock_that_jumps_while_a_command_is_on_its_way_leaves_its_shape_held(bench: Bench) -> None:
+    """As does simulated time that runs fast: how long the driver may take is a matter of the steady clock."""
+    bench.obeys = False
+    order = bench.ask(0.02)
+    bench.ahead = 2.0
+    bench.report()
+    bench.obeys = True
+    bench.move(move_of(order).signals)
+    assert bench.controller.hold.active
 
 
 def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:

@@ -12,7 +12,7 @@ from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import with_point
@@ -83,6 +83,18 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+class Group(TyperGroup):
+    """The command, whose verbs end with the same status when they are interrupted, whatever the version of typer."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the verb."""
+        try:
+            return super().invoke(ctx)
+        except (KeyboardInterrupt, typer.Abort) as error:  # the latter while something is asked
+            fail("interrupted")
+            raise typer.Exit(INTERRUPTED) from error
+
+
 def _show_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
@@ -117,6 +129,7 @@ def make_app() -> typer.Typer:
     """The command with all verbs that are there."""
     app = typer.Typer(
         name="dm",
+        cls=Group,
         help="Open-loop focus with a deformable mirror: calibrate once, then ask for a curvature.",
         epilog=EXIT_CODES,
         no_args_is_help=True,

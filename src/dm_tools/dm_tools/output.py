@@ -24,6 +24,7 @@ WAVELENGTH = 632.8e-9
 
 def _free_standard_output(path: Path | None) -> Path | None:
     """Where figures go to standard output, everything else is written on standard error."""
+    path = STANDARD_OUTPUT if path == Path("/dev/stdout") else path
     console.file = sys.stderr if path == STANDARD_OUTPUT else None  # type: ignore[assignment]
     return path
 
@@ -115,7 +116,10 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    write_whole(path, text.encode())
+    if path.exists() and not path.is_file():  # a device or a pipe, which nothing may stand in for
+        path.write_text(text)
+    else:
+        write_whole(path, text.encode())
     console.print(f"figures: {path}")
 
 

@@ -50,8 +50,8 @@ def record_file(folder: str, serial: str) -> Path | None:
     if not folder:
         return None
     stem = re.sub(r"[^A-Za-z0-9.-]+", "-", serial).strip("-.")[:200] or "mirror"
-    home = os.environ.get("ROS_HOME")
-    place = Path(home + folder.removeprefix("~/.ros")) if home and folder.startswith("~/.ros") else Path(folder)
+    place, home, usual = Path(folder), os.environ.get("ROS_HOME"), Path("~/.ros")
+    place = home / place.relative_to(usual) if home and place.is_relative_to(usual) else place
     return place.expanduser() / f"{stem}.creep.npz"
 
 
@@ -83,7 +83,7 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
             values = [np.asarray(stored[name], dtype=np.float64) for name in names]
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file}: {error}: what was held before is not known") from error
     time, creep_time, crept, sigma, lagged = values
     whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == sigma.shape

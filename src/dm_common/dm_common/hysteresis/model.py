@@ -114,6 +114,10 @@ class HysteresisModel:
             raise ValueError(
                 f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {len(self.creep_time)} columns"
             )
+        if self.lag_spectrum.size and self.lag_spectrum.shape[-1] > len(self.creep_time):
+            raise ValueError(
+                f"lag_spectrum has the shape {self.lag_spectrum.shape}: must be at most {len(self.creep_time)} columns"
+            )
         expected = (2, 1 + len(self.creep_time), 1 + len(self.creep_time))
         if self.creep_covariance.size and self.creep_covariance.shape != expected:
             raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")

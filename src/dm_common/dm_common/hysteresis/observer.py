@@ -136,10 +136,12 @@ class ActuatorEstimate(NamedTuple):
         """Whether the state can be trusted."""
         return not self.unknown
 
-    def after_degauss(self, law: HysteresisModel, actuators: int, time: float, middle: float) -> ActuatorEstimate:
-        """The actuators after a degauss that ends at `time` (s); what they held before may not have been seen."""
-        state = self.state or rested(law, np.full(actuators, middle), time, middle)
-        return ActuatorEstimate(law.degaussed(state, time, middle), "")
+    def after_degauss(
+        self, law: HysteresisModel, actuators: int, begun: float, time: float, middle: float
+    ) -> ActuatorEstimate:
+        """After a degauss from `begun` to `time` (s), while which creep follows the middle; before may be unseen."""
+        state = self.state or rested(law, np.full(actuators, middle), begun, middle)
+        return ActuatorEstimate(law.advance(law.degaussed(state, begun, middle), time), "")
 
 
 class Observed(NamedTuple):

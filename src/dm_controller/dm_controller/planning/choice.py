@@ -116,7 +116,8 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
     active, estimate, degauss = context.active, context.estimate, context.degauss
     begin = context.now + degauss.wait
     if not degauss.begun or degauss.wait > 0.0:
-        estimate = estimate.after_degauss(active.planner.law, active.calibration.actuators, begin, active.middle)
+        law, actuators = active.planner.law, active.calibration.actuators
+        estimate = estimate.after_degauss(law, actuators, context.now, begin, active.middle)
     move = active.planner.plan(
         target,
         estimate.state,

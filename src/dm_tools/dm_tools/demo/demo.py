@@ -29,6 +29,8 @@ from dm_tools.output import (
     write_json,
 )
 
+#: Of the identification of hysteresis and creep.
+MAPS = 200
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 
@@ -151,7 +153,7 @@ def demo(
     speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
     hysteresis_maps: Annotated[
         int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
-    ] = 200,
+    ] = MAPS,
     map_file: Annotated[Path | None, typer.Option("--map", help="A real ZYGO file to ingest first.")] = None,
     config_file: Annotated[
         Path | None, typer.Option("--config", help="Parameter file of another virtual bench, such as mirror_19.yaml.")
@@ -164,13 +166,18 @@ def demo(
     json: JsonOption = None,
 ) -> None:
     """Calibrate a virtual mirror (a PDM30-37) through the real nodes, wire protocol and file formats, then focus it."""
+    from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
+
     if creep is None:
         creep = 0.0 if hysteresis is Hysteresis.off else 0.01
+    if hysteresis_maps and not MAPS_MIN <= hysteresis_maps <= MAPS_MAX:
+        raise typer.BadParameter(f"--hysteresis-maps {hysteresis_maps}: must be 0, or {MAPS_MIN} to {MAPS_MAX}")
     if camera:
         from dm_tools.demo.demo_camera import demo_camera
 
-        if config_file or map_file or keep_maps:
-            raise typer.BadParameter("--camera and --config, --map or --keep-maps: the camera has a bench of its own")
+        if config_file or map_file or keep_maps or hysteresis_maps != MAPS:
+            options = "--config, --map, --hysteresis-maps or --keep-maps"
+            raise typer.BadParameter(f"--camera and {options}: the camera has a bench of its own")
         demo_camera(hysteresis.value, creep, seed, speed, out, json)
         return
     from dm_msgs.action import Calibrate

@@ -23,10 +23,10 @@ DAY_S = 86400.0
 COMMON = ("use_sim_time",)
 
 
-def bench_checks(file: Path) -> Iterator[Check]:
-    """Those that the file calls for."""
+def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
+    """Those that the file calls for, of the mirror in this namespace; "" = in any."""
     try:
-        config = load_config(file)
+        config = load_config(file, namespace.strip("/"))
     except ConfigError as error:
         reason = str(error)
         template = "correct the file; src/dm_bringup/config/hardware.yaml is a template"

@@ -25,7 +25,7 @@ def doctor(
 
     checks = machine_checks(namespace)
     if config is not None:
-        checks += bench_checks(config)
+        checks += bench_checks(config, namespace)
     findings: dict[str, dict[str, Any] | None] = {}
     for name, run in checks:
         finding = held_by_the_nodes(name, run(), findings.get("nodes that are running"))

@@ -26,6 +26,8 @@ from dm_tools.running_suite import REPORT_S, naming_holder, promise, promise_of,
 
 #: What tells the sentence of a result on what --until asked for.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
+#: What --boresight goes by unless told otherwise.
+REGION, IMAGE_TOPIC = "0.25,0.25,0.5,0.5", "image_raw"
 
 
 class CalibrationPlan(StrEnum):
@@ -182,10 +184,10 @@ def calibrate(
     ] = False,
     region: Annotated[
         str, typer.Option(help="With --boresight: left, top, width, height of what stands still, as shares.")
-    ] = "0.25,0.25,0.5,0.5",
+    ] = REGION,
     image_topic: Annotated[
         str, typer.Option(help="With --boresight: the camera's topic, as the node autofocus has it.")
-    ] = "image_raw",
+    ] = IMAGE_TOPIC,
     write: Annotated[
         Path | None,
         typer.Option(help="Write what a poke check or --boresight finds into this copy of the parameter file."),
@@ -213,10 +215,13 @@ def calibrate(
     if config is not None and write is None:
         raise typer.BadParameter("--config without --write: only that needs to know the file of the nodes")
     if boresight:
-        if dry_run or fresh or until or note or surfaces or amplitude or hysteresis is not None or not activate:
+        of_calibration = (dry_run, fresh, until, note, surfaces, amplitude, settle, hysteresis is not None)
+        if any(of_calibration) or (plan, maps_per_state, activate) != (CalibrationPlan.hysteresis, 1, True):
             raise typer.BadParameter("--boresight takes no option of a calibration: it moves the mirror, by images")
         run_boresight(namespace, region, image_topic, take_over, write, config, json)
         return
+    if (region, image_topic) != (REGION, IMAGE_TOPIC):
+        raise typer.BadParameter("--region and --image-topic are for --boresight")
     if (hysteresis is not None or until) and plan != CalibrationPlan.hysteresis:
         option = "--until" if until else "--hysteresis"
         raise typer.BadParameter(f"--plan {plan.value} and {option}: must be the plan hysteresis, which alone has that")
@@ -247,12 +252,12 @@ def calibrate(
                 console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
-        except DeformableMirrorError as error:
-            if error.response is not None:
-                show_result(error.response)
-                if write is not None and source is not None and error.response.parameters:
-                    write_parameters(error.response.parameters, write, source)
-            if fresh:  # refused before it began, it would hold for somebody else's goal
+        except BaseException as error:
+            if (response := getattr(error, "response", None)) is not None:
+                show_result(response)
+                if write is not None and source is not None and response.parameters:
+                    write_parameters(response.parameters, write, source)
+            if fresh:  # refused or interrupted before it began, it would hold for somebody else's goal
                 with suppress(DeformableMirrorError):
                     set_parameter(client, "calibration", "start_fresh", False)
             raise

@@ -142,8 +142,11 @@ def _table(path: Path, *names: str) -> list[list[str]]:
     Raises:
         ValueError: naming the file, and the row that lacks a value or holds what is no number.
     """
-    with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
-        rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
+            rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: must be a table, CSV in UTF-8: {error}") from error
     missing = [name for name in names if name != "degrees" and (not rows or name not in rows[0])]
     if missing:
         raise ValueError(f"{path}: has no column {', '.join(missing)}; the first line must name {', '.join(names)}")

@@ -30,7 +30,7 @@ def record(
     Writes a folder with one MCAP file and metadata.yaml, as `ros2 bag record -s mcap` does.
     """
     from dm_tools.recording.bag import PARAMETER_EVENTS
-    from dm_tools.recording.recorder import Recorder
+    from dm_tools.recording.recorder import COMMON, Recorder
 
     # SIGTERM must finish the file as Ctrl-C does, which a shell lets commands in the background ignore.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -57,10 +57,13 @@ def record(
     for name in recorder.unseen:
         console.print(f"[yellow]not recorded[/] {name}: nobody published it")
     console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
-    if not any(count for name, count in counts.items() if name != PARAMETER_EVENTS):
+    of_others = (PARAMETER_EVENTS,) if names else COMMON  # what all share is recorded in a namespace of nobody, too
+    if not any(count for name, count in counts.items() if name not in of_others):
         shutil.rmtree(folder)
         if names and counts.get(PARAMETER_EVENTS):  # nodes of the suite have answered
             raise RuntimeError("nothing was recorded: --topics names nothing that they publish")
-        raise NotRunningError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
+        raise NotRunningError(
+            "nothing was recorded: are the nodes running (./dm up), in this ROS_DOMAIN_ID and namespace?"
+        )
     seconds = time.monotonic() - started
     write_json(json, {"folder": str(folder), "messages": counts, "refused": recorder.refused, "seconds": seconds})

@@ -73,7 +73,7 @@ def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path 
 
     session = read_session(bag, run, namespace)
     if config is not None:
-        session.parameters.update(load_config(config).get("calibration", {}))
+        session.parameters.update(load_config(config, namespace.strip("/")).get("calibration", {}))
     now, mirror = time.time_ns(), session.run.mirror
     folder = CalibrationStore(store if store is not None else Path("runs/replayed"))
     calibration = recalibrate(session, folder.new_id(mirror.name, mirror.serial, now), now)

@@ -113,7 +113,7 @@ def report(
     file_in_use, values, serial = running_calibration(namespace)
     if store is None:
         calibration = calibration or str(file_in_use or "")
-        store = folder_with(calibration, STORES)
+        store = folder_with(calibration, STORES if file_in_use is None else (file_in_use.parent, *STORES))
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:
         values = DEFAULTS  # another mirror's limits are none of this one
