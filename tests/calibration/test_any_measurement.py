@@ -120,5 +120,13 @@ def test_what_is_refused() -> None:
             identify_response(bad, measured, times) if array is commands else identify_response(commands, measured, bad)
     with pytest.raises(ValueError, match="nothing in it changes"):
         identify_response(commands, np.ones_like(measured), times)
+    found = identify_response(commands, measured, times, candidates=STATIC[:1])
+    for bad, text in (
+        (commands[0], r"commands has the shape \(19,\): must be \(measurements, 19\)"),
+        (commands[:, :3], r"commands has the shape \(160, 3\): must be \(measurements, 19\)"),
+        (np.nan * commands, "commands: row 1 holds NaN"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            found.predict(bad)
     with pytest.raises(ExcitationError, match="actuator 3 turned"):
         identify_response(np.where(np.isin(np.arange(19), (2, 3)), 0.0, commands), measured, times)

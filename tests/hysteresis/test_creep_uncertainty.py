@@ -73,6 +73,13 @@ def test_a_dead_actuator_is_known_no_better_than_before_the_run(dead: int) -> No
     assert np.linalg.eigvalsh(each).min() > 0.0
 
 
+@pytest.mark.parametrize("few", [1, 3])
+def test_a_few_actuators_are_told_apart(few: int) -> None:
+    run = run_of(CREEPS, 150, response=RESPONSE * (np.arange(COUNT) < few))
+    each = creep_covariance(replace(run, signals=run.signals[:, :few]), CREEPS)[1]
+    assert (relative(each) < OWN).all() and np.linalg.eigvalsh(each).min() > 0.0
+
+
 def test_data_without_noise_are_believed_as_far_as_they_can_be() -> None:
     covariance = creep_covariance(run_of(CREEPS, 150, noise=0.0), CREEPS)
     assert np.isfinite(covariance).all()

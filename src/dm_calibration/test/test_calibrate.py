@@ -172,6 +172,11 @@ def test_measurements_and_what_is_refused() -> None:
         calibrate(sag, commands, [0.0, 1.0], mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match="times: hysteresis and creep"):
         calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
+    # A degauss ends at mid range, also where no map shows it.
+    for low, rest in ((-1.0, 0.0), (-0.5, 0.25)):
+        pulled = replace(mirror, limits=replace(mirror.limits, low=low))
+        maps = outcome_of(sag[1:], commands[1:], np.arange(1.0, len(sag)), pulled, settings, hysteresis=True).maps()
+        assert maps.rest == rest and len(maps) == len(sag) - (rest == 0.0)
     with pytest.raises(TooFewMapsError, match="good maps for"):
         calibrate(sag[:2], commands[:2], mirror=mirror, settings=settings)
     with pytest.raises(MeasurementError, match=r"map 1: aperture radius 8\.000 mm"):

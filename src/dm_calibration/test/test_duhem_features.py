@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibration_messages import hysteresis_message
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.features import (
     fading_changes,
     fading_features,
@@ -14,6 +15,9 @@ from dm_calibration.hysteresis.features import (
     weights_of,
 )
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.hysteresis.own_laws import OwnLaws
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.messages import hysteresis_model_from
@@ -72,3 +76,15 @@ def test_slopes_and_lags_of_each_actuator_come_back_from_the_message(own: bool) 
     back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
     assert back is not None
     assert back.same_as(law)
+
+
+def test_the_law_of_a_single_actuator_comes_back_from_the_message() -> None:
+    signals = np.random.default_rng(4).uniform(-1.0, 1.0, (60, 1))
+    seen = 1e-6 * (signals + WEIGHT * fading_features(signals, FadingHysteresis(np.array([2.0])))[:, 0])
+    all_maps = np.ones(60, dtype=bool)
+    run = Run(signals, np.arange(60.0), Responses(seen, 1, all_maps))
+    common = HysteresisModel(np.zeros(1), np.ones((1, 1)), np.array([1.4]), WEIGHT, 0.0, CREEP_TIMES)
+    law = OwnLaws(run, CANDIDATES[-1], common, np.full(1, 1e-9)).fit(all_maps).law
+    back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
+    assert back is not None
+    np.testing.assert_allclose(run.follow(back), run.follow(law))

@@ -162,6 +162,8 @@ def test_other_numbers_of_actuators() -> None:
         Plate(PlateConfig(actuators=20))
     with pytest.raises(ValueError, match=r"plate\.actuator_x has 1 values, plate\.actuator_y 0"):
         Plate(PlateConfig(actuator_x=(0.0,)))
+    with pytest.raises(ValueError, match=r"plate\.actuator_x and _y: 3 actuators on one line"):
+        Plate(PlateConfig(actuator_x=(-0.004, 0.0, 0.004), actuator_y=(0.0, 0.0, 0.0)))
 
 
 def test_design_numbers(plate: Plate) -> None:

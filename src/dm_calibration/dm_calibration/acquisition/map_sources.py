@@ -12,7 +12,7 @@ from dm_calibration.hysteresis.excitation import CHECK_SHARE
 from dm_calibration.influence.maps import CHECK, EXCITATION, POKE, REFERENCE, SURFACE
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.procedure.map_acquisition import check_comparable
-from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup
+from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
 from dm_common import Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
@@ -65,6 +65,10 @@ def outcome_of(
             raise MeasurementError(error.error_code, f"{label}: {error}") from error
         if outcome.setup is None:
             outcome.take(Setup.of(one))
+            if hysteresis and kind != REFERENCE and mirror.limits.middle:
+                # No map shows where the degauss ended, and a mirror that is driven one way ends it elsewhere than at 0.
+                rest = {"kind": REFERENCE, "step": -1, "signals": mirror.rest, "applied": mirror.rest}
+                outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **rest))
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
         outcome.take(MapTaken(one, one.radius > 0.0))
     return outcome

@@ -50,10 +50,11 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
     shared = np.linalg.inv(evidence / excess + np.linalg.inv(prior))
     # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.
-    # It takes the place of one of those three: it does not follow them, so the others show that pattern.
+    # It takes the place of one of those three: it does not follow them, so the others show that pattern. Three
+    # actuators or fewer that show anything at all do not make a plane.
     moves = np.linalg.norm(gains, axis=1)
     alive = moves > DEAD * moves.max()
-    hidden = max(PISTON_TILT, int((~alive).sum()))
+    hidden = max(PISTON_TILT if len(gains) > PISTON_TILT else 0, int((~alive).sum()))
     size, axes = np.linalg.eigh(gains @ gains.T)
     weight = np.zeros(len(gains))
     weight[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)

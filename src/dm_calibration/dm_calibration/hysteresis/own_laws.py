@@ -130,7 +130,8 @@ class OwnLaws:
         """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all.
 
         Args:
-            own_fading: of those from no hysteresis: False keeps the common Duhem operator for all actuators.
+            own_fading: of those from no hysteresis: False keeps the common Duhem operator for all actuators; a single
+                actuator's is always that, since messages tell one weight with one slope for both ways.
         """
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
@@ -142,7 +143,7 @@ class OwnLaws:
             creep = np.zeros((len(self._creep_root), actuators))
             creep[ELEMENTS] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
-            if slope.size and own_fading:
+            if slope.size and own_fading and actuators > 1:
                 slope = padded_slope(slope, actuators)
                 own = self._linear.stop
                 for _ in range(DUHEM_ROUNDS):

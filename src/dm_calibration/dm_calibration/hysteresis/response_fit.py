@@ -52,8 +52,11 @@ class ResponseFit:
     remark: str = ""
 
     def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
-        """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to."""
-        signals = np.asarray(commands, dtype=np.float64)
+        """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to.
+
+        Raises ValueError as :func:`identify_response` does for commands and times.
+        """
+        signals = _signals(commands, len(self.influence))
         rested = self.law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S)
         effective, _ = follow(self.law, rested, signals, _seconds(times, len(signals)))
         return np.asarray(self.figure + effective @ self.influence)
@@ -97,16 +100,9 @@ def identify_response(
     ValueError
         Arrays that do not belong together, measurements that never change, or times that run backwards.
     """
-    signals, values = (np.asarray(array, dtype=np.float64) for array in (commands, measured))
-    if signals.ndim != 2 or not signals.size:
-        raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, actuators)")
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
-    if not finite.all():
-        raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")
+    signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
     if values.ndim != 2 or len(values) != len(signals):
         raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, numbers of a measurement)")
-    if np.abs(signals).max() > 1.0 + 1e-9:
-        raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
     seconds = _seconds(times, len(signals))
     if not np.ptp(seconds) > 0.0:
         raise ValueError("times: all are the same; leave them out where they are not known")
@@ -136,6 +132,18 @@ def identify_response(
         measurements=int(usable.sum()),
         remark=found.quiet_remark,
     )
+
+
+def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
+    signals = np.asarray(commands, dtype=np.float64)
+    if signals.ndim != 2 or not signals.size or signals.shape[1] != (actuators or signals.shape[1]):
+        raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, {actuators or 'actuators'})")
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
+    if not finite.all():
+        raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")
+    if np.abs(signals).max() > 1.0 + 1e-9:
+        raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
+    return signals
 
 
 def _seconds(times: ArrayLike | None, count: int) -> Floats:

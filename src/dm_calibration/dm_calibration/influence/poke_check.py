@@ -113,6 +113,8 @@ def check_pokes(
         problem = (
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
             "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
+            if quiet.any()
+            else f"{active.size} actuators were moved: wiring and orientation can be checked from {ANSWERS_MIN} on"
         )
         return replace(nothing, findings=(problem, *findings))
     single, double = active, {}

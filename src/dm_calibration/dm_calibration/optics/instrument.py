@@ -63,6 +63,7 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
 
     Raises:
         ValueError: too few maps, maps of different sizes or shapes, or tilts that do not differ in both directions.
+        InsufficientDataError: a map with too few valid pixels for the terms.
     """
     if len(maps) < MAPS_MIN or len({sag.shape for sag in maps}) > 1:
         sizes = sorted({"{1} x {0}".format(*sag.shape) for sag in maps})

@@ -7,7 +7,8 @@ Each thing that happens is an event. A live run takes its events one by one and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -73,6 +74,14 @@ class Unseen:
     """A command without a map, kept because it belongs to the history of the actuators."""
 
     record: Measurement
+
+
+def without_map(record: Measurement, **changes: Any) -> Unseen:
+    """A command without a map: `record` less all that its map tells, and with `changes`."""
+    nothing = np.full_like(record.coefficients, np.nan)
+    unseen = replace(record, coefficients=nothing, sigma=nothing, sag=np.full_like(record.sag, np.nan), nominal=None)
+    unseen = replace(unseen, residual_rms=np.nan, valid_fraction=0.0, file="", sha256="", moved_ns=0)
+    return Unseen(replace(unseen, **changes))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
-from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
+from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, without_map
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, shape_in_use
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
@@ -208,23 +208,5 @@ class Procedure:
             return
         # A reference frame without a map is a command like others: no figure is followed from it, no bump judged by it.
         kind = StepKind.EXCITATION if step.kind is StepKind.REFERENCE else step.kind
-        nothing = np.full_like(records[-1].coefficients, np.nan)
-        assert step.signals is not None
-        unseen = replace(
-            records[-1],
-            label=step.label,
-            kind=kind.value,
-            step=number,
-            signals=step.signals,
-            applied=applied,
-            coefficients=nothing,
-            sigma=nothing,
-            sag=np.full_like(records[-1].sag, np.nan),
-            residual_rms=np.nan,
-            valid_fraction=0.0,
-            file="",
-            sha256="",
-            nominal=None,
-            moved_ns=0,
-        )
-        self._note(Unseen(unseen))
+        told = {"label": step.label, "kind": kind.value, "step": number, "signals": step.signals, "applied": applied}
+        self._note(without_map(records[-1], **told))

@@ -152,6 +152,11 @@ class Plate:
                 f"plate.pitch = {config.pitch:g} m, or plate.actuator_x and _y: actuators beyond the edge of the plate,"
                 f" plate.diameter = {config.diameter:g} m"
             )
+        if np.linalg.matrix_rank((self.x - self.x.mean(), self.y - self.y.mean())) < 2:
+            raise ValueError(
+                f"plate.actuator_x and _y: {len(self.x)} actuators on one line cannot hold the plate: must be three or"
+                " more that are not"
+            )
         self.terms = zernike.terms_to_order(config.order)
         self.rigidity = config.youngs_modulus * config.thickness**3 / (12 * (1 - config.poisson_ratio**2))
         self.stiffness = self.rigidity / self.radius**2 * bending_energy_matrix(self.terms, config.poisson_ratio)
