@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 
-from dm_calibration.procedure.applied_history import AppliedHistory, SettledState
+from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError, SettledState
 from dm_common.hysteresis.creep_record import CreepRecord, record_of
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
@@ -31,7 +32,8 @@ def build_recipes(
     """Recipes of these curvatures, built on the bench as it stands, and why others of them could not be built.
 
     Args:
-        on_map: called with each map, and what stood at the mirror.
+        on_map: called with each map, and what stood at the mirror. What it changes of the calibration is in no
+            `by_model` of the recipes.
     """
     tracker, history = HysteresisTracker(planner.law), AppliedHistory()
     history.follow(planner.law)
@@ -46,7 +48,8 @@ def build_recipes(
             history.observe(report)
         seen = len(bench.reports)
         assert bench.latest is not None
-        on_map(bench.latest, history.settled(bench.time, 0.0))
+        with suppress(MapNotUsableError):  # as the node, which goes on without such a map
+            on_map(bench.latest, history.settled(bench.time, 0.0))
 
     options = BuildOptions(settle_time=bench.config.settle_time)
     builder = RecipeBuilder(planner, bench, lambda: bench.time, options, state=tracker.state, on_step=on_step)

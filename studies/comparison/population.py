@@ -130,7 +130,7 @@ class _KeptTrue:
     def active(self) -> ActiveCalibration:
         """As it is now."""
         message = calibration_message(self._calibration, None, "mirror", 1.0)
-        if (kept := self._updates.in_use) is not None and kept.drift.revision:
+        if (kept := self._updates.in_use) is not None and (kept.drift.revision or kept.drift.surprising):
             put_updates(message, kept, math.nan, [], self._updates.mirror_changed)
         return active_of(self._bench, message)
 

@@ -225,6 +225,19 @@ def test_recipes_are_built_and_stored(rig: Rig) -> None:
     assert "back at mid range" in result.message
 
 
+def test_recipes_know_what_their_maps_have_taught_the_calibration(rig: Rig) -> None:
+    _, future = rig.send(recipes(0.02))
+    wait_until(lambda: len(rig.bench.measured) >= 2, 60)
+    taught = calibration(held_out_rms=1e-10, held_out_max_zernike=1e-10)
+    taught.zernike_offset[4] += 50e-9
+    rig.host.focus.use(taught, mirror_info())
+    wait_until(lambda: future.done(), 60)
+    assert rig.host.focus.active is not None
+    (recipe,) = recipe_book_from(rig.stored[0].recipes).recipes
+    now = rig.host.focus.active.mirror.command(FocusTarget(0.02))[0]
+    np.testing.assert_allclose(recipe.by_model, now)
+
+
 def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(rig: Rig) -> None:
     result = rig.run_cancelled(recipes(-0.02, 0.0, 0.01, 0.02, 0.03), maps=5)
     assert 1 <= result.recipes < 5

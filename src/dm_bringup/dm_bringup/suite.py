@@ -46,6 +46,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
     result: Config = {}
+    own = set[str]()
     for key, section in content.items():
         place, _, name = str(key).rpartition("/")
         if namespace and "*" not in place and place.strip("/") not in ("", namespace):
@@ -54,9 +55,14 @@ def load_config(path: Path, namespace: str = "") -> Config:
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
-        if name in result:
-            raise ConfigError(f"{path}: {key}: a second section of {name}; of which mirror is not told by a namespace")
-        result[name] = flat(section["ros__parameters"])
+        values = flat(section["ros__parameters"])
+        if "*" in place:  # of every mirror: what a section of its own says counts, as to ROS
+            result[name] = values | result.get(name, {})
+            continue
+        if name in own:
+            raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or told by the namespace")
+        own.add(name)
+        result[name] = result.get(name, {}) | values
     return result
 
 

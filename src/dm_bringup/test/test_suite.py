@@ -57,6 +57,9 @@ def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: 
     with pytest.raises(ConfigError, match="/right/pdm_driver: a second section of pdm_driver"):
         load_config(file)
     assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0}}
+    with file.open("a") as lines:
+        lines.write("/**/pdm_driver: {ros__parameters: {volts.max: 200.0, simple: 2}}\n")
+    assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0, "simple": 2}}
 
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:

@@ -538,8 +538,9 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
     assert (good.accepted, bad.accepted) == (1, 0) and good.time < bad.time == pytest.approx(1e-9 * bench.clock_ns)
     assert good.max_zernike < 2e-9 < bad.max_zernike and good.surprise < 2.0 < bad.surprise
     assert 1 <= good.actuator <= bench.mirror.actuators
-    for taken in (3, 1):
+    whole = file.read_bytes()
+    for content, taken in ((whole, 3), (whole + b"\r\n", 3), (b"", 1)):
+        file.write_bytes(content)
         updates.take(bench.measure("bad"), bench.settled())
         assert len(read_checks(file)) == taken
-        file.write_bytes(b"")
     assert read_checks(tmp_path / "none.csv") == []

@@ -65,7 +65,7 @@ class ActuatorWriter(WriterThread):
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.
 
-        A unit may take its frames slower than the limits allow: it is given up `timeout_s` after the last that it took.
+        A unit may take its frames slower than the limits allow: it is given up when it has taken none for `timeout_s`.
         """
         with self._change:
             self._accepting = False
@@ -76,7 +76,7 @@ class ActuatorWriter(WriterThread):
                 self._put(move)
             else:
                 move.finish(Outcome.LINK_LOST)
-        written = -1
+        written = self.counters.frames
         while (outcome := move.wait(timeout_s)) is None and written != self.counters.frames:
             written = self.counters.frames
         with self._change:

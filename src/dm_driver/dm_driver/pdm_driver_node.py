@@ -127,6 +127,7 @@ class PdmDriverNode(ManagedNode):
         self._publish_state()
 
     def clean_up(self) -> None:
+        self._gate.trouble = ""
         self._close("cleanup")
 
     def make_safe(self) -> None:

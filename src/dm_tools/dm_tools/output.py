@@ -116,7 +116,8 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    if path.exists() and not path.is_file():  # a device or a pipe, which nothing may stand in for
+    # Nothing may stand in for a device or a pipe.
+    if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
         path.write_text(text)
     else:
         write_whole(path, text.encode())

@@ -285,8 +285,5 @@ def measured_ns(surface: SurfaceMap, now_ns: int, believe_header: bool) -> int:
     """
     if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now_ns:
         return round(surface.time_stamp * 1e9)
-    try:
-        modified = Path(surface.file).stat().st_mtime_ns
-    except OSError:
-        return now_ns
-    return modified if (0 if believe_header else now_ns - _RECENT_NS) < modified <= now_ns else now_ns
+    oldest = 0 if believe_header else now_ns - _RECENT_NS
+    return surface.written_ns if oldest < surface.written_ns <= now_ns else now_ns

@@ -87,7 +87,7 @@ def _measured(maps: Maps, settings: IngestSettings) -> list[Measurement]:
             found.append(one)
         elif isinstance(one, str | Path):
             surface, measured = ingest.read(Path(one), settings)
-            at = surface.time_stamp or Path(one).stat().st_mtime
+            at = surface.time_stamp or 1e-9 * surface.written_ns
             found.append(replace(measured, stamp_ns=round(1e9 * at), sha256=surface.sha256))
         else:
             sag = np.asarray(one, dtype=np.float64)

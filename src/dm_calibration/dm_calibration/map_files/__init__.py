@@ -1,5 +1,6 @@
 """Readers of interferometer map files: `read_map(path).sag` is the surface sag in metres."""
 
+import contextlib
 import dataclasses
 import os
 import stat
@@ -47,7 +48,10 @@ def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> Su
         raise MapFileError(f"{name}: {error.strerror or error}") from error
     except MapFileError as error:
         raise type(error)(f"{name}: {error}") from error
-    return dataclasses.replace(surface_map, file=name, content=content)
+    written_ns = 0
+    with contextlib.suppress(OSError):  # what was read is good, even if it is gone since
+        written_ns = path.stat().st_mtime_ns
+    return dataclasses.replace(surface_map, file=name, written_ns=written_ns, content=content)
 
 
 def is_complete(path: Path) -> bool:

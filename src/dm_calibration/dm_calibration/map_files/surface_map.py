@@ -66,6 +66,8 @@ class SurfaceMap:
         system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
         phase_steps: number of regions that stood whole fringes off and were brought back.
+        file: its path, as text that is UTF-8; "" = none.
+        written_ns: when that was last written, Unix time, ns; 0 = not known.
         content: the file's bytes, for :attr:`sha256`.
     """
 
@@ -81,6 +83,7 @@ class SurfaceMap:
     piston_tilt_removed: bool = False
     phase_steps: int = 0
     file: str = ""
+    written_ns: int = 0
     content: bytes = field(default=b"", repr=False)
 
     @cached_property

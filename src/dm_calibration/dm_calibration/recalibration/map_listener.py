@@ -66,6 +66,7 @@ class MapListener:
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self.history = AppliedHistory()  # what stood at the mirror, which the node forgets with it
+        self._followed: Any = None  # law and mid range
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
         self._exchange = threading.Lock()  # a map is compared by the law that its effective signals are of
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
@@ -89,12 +90,15 @@ class MapListener:
 
     def begin(self, calibration: Calibration | None) -> None:
         """Keep `calibration` true from now on, and follow its hysteresis about the mid range of the mirror as it is."""
-        kept = self._updates.in_use
+        same = calibration is getattr(self._updates.in_use, "calibration", None)
         middle = float(mirror.rest[0]) if (mirror := self._manager.mirror) is not None else 0.0
         law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
+        if same and (law, middle) == self._followed:
+            return
         with self._exchange:
+            self._followed = law, middle
             self.history.follow(law, middle)
-            if calibration is (kept and kept.calibration):
+            if same:
                 return
             self._updates.folder = self._manager.store.folder
             try:

@@ -32,6 +32,8 @@ from dm_controller.planning.target import FocusTarget
 #: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.
 STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
+#: For the calibration node to judge the last map, half a second after its stamp, and to publish what it has shown, s.
+JUDGED_S = 2.0
 
 
 class RecipeRun:
@@ -97,6 +99,7 @@ class RecipeRun:
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
+            time.sleep(JUDGED_S)
             now = self._planner_now(active)
             book = recipe_book(recipes, now, steps, round(1e9 * bench.now()), active.recipes)
             result.interpolation_error = book.interpolation_error

@@ -17,7 +17,8 @@ from dm_common.values import real, text
 LEASE_S = 3.0
 #: Longest lease that may be asked for, s.
 LEASE_MAX_S = 3600.0
-
+#: Holders whose hold was taken over that are remembered.
+EVICTED_KEPT = 100
 
 #: What may be asked, as its constants HOLD, RENEW, TAKE_OVER and RELEASE.
 Operation = HoldMirror.Request
@@ -119,6 +120,8 @@ class MirrorHold:
         """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
         if self._holder not in ("", holder):
             self._evicted[self._holder], self._holder = by, ""
+            if len(self._evicted) > EVICTED_KEPT:
+                del self._evicted[next(iter(self._evicted))]
 
     def _sentence(self) -> str:
         if not self._current():
