@@ -193,7 +193,8 @@ class FocusController:
                 assert active is not None  # else it is refused
                 raise unreachable(move, active, tolerance)
             if not dry_run:
-                now.check()
+                if now.simulated and not now.ns:  # creep would take its jump for the time that the shape has stood
+                    raise Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)
                 at_once = degaussed is not None or (move.degauss is None and self.conditioning.run is None)

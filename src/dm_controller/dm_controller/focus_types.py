@@ -8,7 +8,7 @@ from typing import NamedTuple
 from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import Refusal
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
 
@@ -27,11 +27,6 @@ class Moment(NamedTuple):
     time: float
     steady: float
     simulated: bool = False
-
-    def check(self) -> None:
-        """Raise Refusal before the first message on /clock: creep would take that for the time the shape has stood."""
-        if self.simulated and not self.ns:
-            raise Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
 
 
 @dataclass(eq=False)

@@ -20,7 +20,7 @@ from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
 from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import Corrections, UnreachableError
+from dm_controller.planning.recipes import Corrections, UnreachableError, target_of
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag
 
@@ -257,10 +257,7 @@ def recipe_book(
     Raises:
         RecipeError: those were made under another condition.
     """
-    shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
-    known = [
-        replace(recipe, by_model=loop.mirror.command(shape)[0]) for recipe, shape in zip(recipes, shapes, strict=True)
-    ]
+    known = [replace(recipe, by_model=loop.mirror.command(target_of(recipe))[0]) for recipe in recipes]
     ordered = sorted(known, key=lambda recipe: recipe.shape)
     book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
     whole = before.merged(book)

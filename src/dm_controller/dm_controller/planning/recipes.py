@@ -18,7 +18,7 @@ import numpy as np
 from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.optics.zernike import PISTON_TILT, TERMS
-from dm_common.recipes import RecipeBook, RecipeError, shape_text, terms_text
+from dm_common.recipes import Recipe, RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import TARGET, FocusTarget, Shape
 
@@ -103,7 +103,7 @@ class Corrections:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
-        shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
+        shapes = [target_of(recipe) for recipe in recipes]
         for shape in shapes:
             TARGET.check(shape)
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
@@ -205,6 +205,11 @@ class UnreachableError(CodedError, RecipeError):
     """The limits of the actuators deny the shape."""
 
     error_code = ErrorCode.UNREACHABLE
+
+
+def target_of(recipe: Recipe) -> FocusTarget:
+    """The shape that a recipe makes."""
+    return FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike)
 
 
 def recipe_targets(
