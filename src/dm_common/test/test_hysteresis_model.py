@@ -141,9 +141,9 @@ def test_slope_min_of_own_laws_is_that_of_the_steepest_loop_alone() -> None:
     assert slope_min(both) == pytest.approx(min(slope_min(law) for law in alone), abs=1e-12)
 
 
-def test_scaled_spans_two() -> None:
-    law = rich()
-    assert span(normalised(law)) == pytest.approx(2.0, rel=1e-9)
+@pytest.mark.parametrize("ends", [(-1.0, 1.0), (0.0, 1.0), (-0.5, 1.0)])
+def test_normalised_spans_what_the_signals_span(ends: tuple[float, float]) -> None:
+    assert span(normalised(rich(), *ends), *ends) == pytest.approx(ends[1] - ends[0], rel=1e-9)
 
 
 def test_duhem_of_first_order_is_an_exponential() -> None:

@@ -94,7 +94,7 @@ class LawFit:
     """A candidate fitted to some rows of a run.
 
     Attributes:
-        law: with effective signals that span 2 in a full cycle.
+        law: with effective signals that span in a full cycle of the run what signals do.
         residual: (M, D) of all rows, those left out included; units of `Responses.values`.
     """
 
@@ -190,7 +190,7 @@ class CandidateProblem:
             float(nonlinear[-1]),
             CREEP_TIMES,
         )
-        return normalised(law)
+        return normalised(law, *self.run.reach)
 
 
 def _alternate(features: Floats, measured: Floats, weights: Floats) -> Floats:

@@ -192,7 +192,7 @@ class OwnLaws:
         return patterns, creep, scatter, residual
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
-        """The law of the weights (F, N) and (J + L + 1, N), effective signals spanning 2 in a full cycle."""
+        """The law of the weights (F, N) and (J + L + 1, N)."""
         orders = self.candidate.powers
         series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(self.radius), orders)
         powers = [
@@ -204,21 +204,20 @@ class OwnLaws:
         share, lag = np.maximum(creep[ELEMENTS].T, 0.0), creep[LAGGED].T
         mean = float(share.mean())
         share[:, :LAGS] += lag
-        return normalised(
-            HysteresisModel(
-                self.radius,
-                play_weight,
-                slope,
-                patterns[-1].copy() if slope.size else 0.0,
-                min(mean / PER_ELEMENT, CREEP_RATE_MAX),  # a law that creeps so much is not taken
-                CREEP_TIMES,
-                share / mean if mean else np.zeros(0),
-                lag_spectrum=-lag / mean if mean else np.zeros(0),
-                creep_slope=float(creep[-1].mean()),
-                fading_rate=FADING_RATE if linear.size else NONE,
-                fading_weight=linear.reshape(-1, len(FADING_RATE), FADING_POWERS) if linear.size else NO_DRIVE,
-            )
+        law = HysteresisModel(
+            self.radius,
+            play_weight,
+            slope,
+            patterns[-1].copy() if slope.size else 0.0,
+            min(mean / PER_ELEMENT, CREEP_RATE_MAX),  # a law that creeps so much is not taken
+            CREEP_TIMES,
+            share / mean if mean else np.zeros(0),
+            lag_spectrum=-lag / mean if mean else np.zeros(0),
+            creep_slope=float(creep[-1].mean()),
+            fading_rate=FADING_RATE if linear.size else NONE,
+            fading_weight=linear.reshape(-1, len(FADING_RATE), FADING_POWERS) if linear.size else NO_DRIVE,
         )
+        return normalised(law, *self.run.reach)
 
     def _with_creep(self, features: Floats, creep: Floats, patterns: Floats) -> Floats:
         """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""

@@ -56,15 +56,15 @@ def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, rad
     return np.stack(smallest).transpose(0, 3, 2, 1)
 
 
-def span(law: HysteresisModel) -> Floats:
-    """Effective signal at +1 less that at -1 in a full cycle that closes, of each law: (1,) or (N,)."""
-    low = turned(law, (1.0, -1.0, 1.0, -1.0))
-    return np.asarray(law.move(low, np.ones_like(low.signals), 0.0).position - low.position)
+def span(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
+    """Effective signal at `high` less that at `low` in a full cycle that closes, of each law: (1,) or (N,)."""
+    lower = turned(law, (high, low, high, low), 0.5 * (low + high))
+    return np.asarray(law.move(lower, np.full_like(lower.signals, high), 0.0).position - lower.position)
 
 
-def normalised(law: HysteresisModel) -> HysteresisModel:
-    """The same law with effective signals that span 2."""
-    return law.scaled(2.0 / span(law))
+def normalised(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> HysteresisModel:
+    """The same law with effective signals that span as much as signals of `low` .. `high`, in a full cycle."""
+    return law.scaled((high - low) / span(law, low, high))
 
 
 def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:

@@ -1,7 +1,7 @@
 """The law by which actuators remember, and the state of a mirror under it.
 
 Every actuator follows an *effective signal*; sag and coefficients are linear in it, and the influence function holds
-the gains. Signals are normalised, so is the effective signal: it spans 2 over a slow full cycle of -1 .. +1.
+the gains. Signals are normalised; over a slow full cycle of those of the run the effective signal spans what they do.
 
 * Hysteresis: a sum over play operators p_r of half-width r of polynomials in their values. With first powers it is the
   Prandtl-Ishlinskii model ([16], section 2.4); higher powers make

@@ -30,9 +30,8 @@ NO_TILT = (
     "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
     "camera's picture moves with the focus; calibrate from maps that keep their tilt, or set hold_tilt = false"
 )
-#: A law is scaled so that effective signals span this over a full cycle; gains are in the influence function.
-SPAN = 2.0
-SPAN_TOLERANCE = 0.2
+#: How far the span of effective signals in a full cycle may be from that of the signals, as a share of it.
+SPAN_TOLERANCE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,11 +209,12 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         raise ValueError(
             f"hysteresis: play_weight: laws of {law.actuators} actuators, must be of {calibration.actuators} or one"
         )
-    spans = span(law)
-    furthest = spans[np.abs(spans - SPAN).argmax()]
-    if not abs(furthest - SPAN) <= SPAN_TOLERANCE:
+    spans = span(law, limits.low, limits.high) / (limits.high - limits.low)
+    furthest = spans[np.abs(spans - 1.0).argmax()]
+    if not abs(furthest - 1.0) <= SPAN_TOLERANCE:
         raise ValueError(
-            f"hysteresis: play_weight: effective signals span {furthest:.3g}, must be {SPAN:g}: a law of another scale"
+            f"hysteresis: play_weight: effective signals span {furthest:.3g} times what signals do: must be 1 +- "
+            f"{SPAN_TOLERANCE:g}, this is a law of another scale"
         )
     for name in ("held_out_max_zernike", "unknown_sigma"):
         value = getattr(hysteresis, name)

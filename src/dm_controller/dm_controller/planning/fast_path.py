@@ -29,7 +29,7 @@ from dm_controller.planning.target import FocusTarget, Shape
 #: Error of an effective signal from which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
 #: times below, the tables of Duhem operators reach half of it.
 EXACT = 1e-5
-#: Distance of actuators on the common scale on which all places are looked up at once; effective signals span 2.
+#: Distance of actuators on the common scale on which all places are looked up at once; effective signals span about 2.
 APART = 1e3
 #: Powers of q that are kept.
 ORDERS = 4
