@@ -319,6 +319,19 @@ def test_ended_in_the_middle_the_mirror_still_goes_back(
     assert "Traceback" not in process.output, process.output
 
 
+def test_ended_in_a_dry_run_the_mirror_stays_where_it_is(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
+    node, moved = CalibrationNode(), list[Any]()
+    monkeypatch.setattr(node._bench_services, "rest_at_exit", moved.append)
+    node._manager.set_mirror(make_mirror(RINGS))
+    node._server._running = 1
+    node.make_safe()
+    assert not moved
+    with node._bench_services.hold._one:  # a run has the mirror
+        node.make_safe()
+    assert len(moved) == 1
+    node.destroy_node()
+
+
 def test_another_folder_or_name_takes_effect_with_the_next_activation(
     observer: Observer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -258,8 +259,11 @@ def test_a_bumped_mirror_is_found_by_the_reference_frame(bump: dict[str, float],
 
 def test_another_mirror_in_the_middle_stops_the_run(rig: Rig) -> None:
     rig.start()
-    stopped = rig.run_with(lambda: rig.bench.publish_info(make_mirror(1, serial="T-2")))
+    mirror = make_mirror(1, serial="T-2")
+    mirror = replace(mirror, limits=replace(mirror.limits, low=-0.5))
+    stopped = rig.run_with(lambda: rig.bench.publish_info(mirror))
     assert stopped.error_code == ErrorCode.CALIBRATION_MISMATCH and "'T-2', before it was" in stopped.message
+    assert (rig.bench.signals == 0.25).all()  # mid range of the mirror that is there now
     other = rig.run()  # with the other mirror: a run of its own
     assert other.error_code == ErrorCode.OK and "resumed" not in other.message
     assert len(rig.unfinished()) == 1

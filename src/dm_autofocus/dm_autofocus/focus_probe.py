@@ -210,8 +210,7 @@ class FocusProbe:
         Raises:
             Refusal: refused, no answer, another node moves the mirror, the move does not end, or the user is to stop.
         """
-        if self._hold.lost is not None:
-            raise self._hold.lost
+        self._wait(lambda: True, 0.0, self._check)  # who is to stop asks for no other shape
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
             self.answer, self._degauss_s = None, 0.0

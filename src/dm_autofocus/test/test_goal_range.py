@@ -1,16 +1,18 @@
-"""What a goal is refused for before anything moves."""
+"""What a goal is refused or ended for before anything moves."""
 
 from __future__ import annotations
 
 import math
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 from dm_msgs.action import Autofocus
 from dm_msgs.msg import Capabilities
 
 from dm_autofocus.autofocus_parameters import PARAMETERS, search_config
+from dm_autofocus.focus_probe import FocusProbe
 from dm_autofocus.probe_action import range_of, ready_capabilities
 from dm_common.errors import ErrorCode, Refusal
 
@@ -27,6 +29,20 @@ def test_a_mirror_that_reaches_nothing_is_not_focused() -> None:
     with pytest.raises(Refusal, match="no curvature is reachable") as refused:
         ready_capabilities(cast(Any, probe))
     assert refused.value.error_code == ErrorCode.UNREACHABLE
+
+
+def test_a_goal_that_was_cancelled_between_two_images_asks_for_no_other_shape() -> None:
+    node = MagicMock()
+    node.get_name.return_value = "autofocus"
+    probe = FocusProbe(node, {"settle_time": 0.0, "stamp_lead": 0.0, "move_timeout": 1.0})
+
+    def cancelled() -> None:
+        raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
+
+    probe._check = cancelled
+    with pytest.raises(Refusal, match="holds the shape it has"):
+        probe.move(0.01)
+    node.create_publisher().publish.assert_not_called()
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.05, 0.05), (0.05, -0.05), (math.nan, 0.05), (-math.inf, 0.05)])

@@ -140,7 +140,7 @@ class CalibrateAction:
             result.dropped = result.dropped or list(run.outcome.dropped)
         finally:
             run.journal.close()
-            rested = self._services.rest(self._mirror.rest)
+            rested = self._services.rest(self._manager.known_mirror().rest)  # as it is now
         kept = ""
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (

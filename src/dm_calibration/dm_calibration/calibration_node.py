@@ -109,7 +109,7 @@ class CalibrationNode(ManagedNode):
         """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
         self._listener.stop()
         mirror = self._manager.mirror
-        if self._server.busy and mirror is not None:
+        if self._server.busy and self._bench_services.hold.end() and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench_services.rest_at_exit(mirror.rest)}")
         self._reports.end()
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from dm_msgs.action import Degauss
 from dm_msgs.srv import SetSignals
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.ros import bench_services
 from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.clients import ServiceCallError
+from dm_common.ros.worker import WorkerActionServer
 from ros_fixtures import Observer
 
 #: Longest pause before a node that died is started again, s.
@@ -58,6 +63,15 @@ def test_a_map_is_taken_again_when_the_interferometer_is_back_but_not_for_ever(m
     assert not isinstance(refused.value, MeasurementError)  # which would be tried again
 
 
+def test_a_map_that_the_end_of_the_process_cuts_off_has_not_failed() -> None:
+    bench = Bench(deaths=0)
+    bench.cancelled = lambda: False
+    bench._node = cast(Any, SimpleNamespace(context=SimpleNamespace(ok=lambda: False)))
+    server: Any = SimpleNamespace(wait_for_return=lambda _stop: None, since_now=lambda _ready: lambda: "")
+    with pytest.raises(Cancelled), bench._answered("measure", server, lambda: True):
+        raise ServiceCallError("measure: cancelled")
+
+
 def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: Observer) -> None:
     asked: list[str] = []
 
@@ -70,9 +84,14 @@ def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: O
 
     for name in ("/set_signals", "/left/set_signals", "/left/remapped"):
         serve(name)
+    WorkerActionServer(observer.node, Degauss, "/left/degauss", lambda _: ("succeed", Degauss.Result()))
     for remap in ([], ["--ros-args", "-r", "set_signals:=remapped"]):
         node = Node("calibration", namespace="/left", cli_args=remap, context=observer.node.context)
-        bench = BenchServices(node, {"settle_time": 0.0, "driver_timeout": 5.0})
+        bench = BenchServices(node, {"settle_time": 0.0, "driver_timeout": 5.0, "degauss_timeout": 5.0})
         assert bench.rest_at_exit(np.zeros(37)) == "the mirror is back at mid range"
+        # A run that is still under way in its thread undoes nothing of that.
+        for command in (partial(bench.apply, np.ones(37)), bench.degauss):
+            with pytest.raises(Cancelled, match="the process ends"):
+                command()
         node.destroy_node()
     assert asked == ["/left/set_signals", "/left/remapped"]

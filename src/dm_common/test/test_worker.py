@@ -10,10 +10,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+import rclpy
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import Converge, Degauss, MoveFocus
 from dm_msgs.msg import ErrorCode, FocusRequest
 from dm_msgs.srv import Flatten, HoldMirror, PredictError, SetSignals
+from rclpy.node import Node
 from rclpy.time import Time
 from std_msgs.msg import Int32
 
@@ -303,6 +305,13 @@ def test_call_gives_up_on_a_silent_server_and_on_cancel(observer: Observer) -> N
         call(client, Flatten.Request(), timeout_s=2.0)
     with pytest.raises(ServiceCallError, match="cancelled"):
         call(client, Flatten.Request(), timeout_s=20, cancelled=lambda: True)
+    context = rclpy.Context()  # of a process that ends: its worker threads must not keep it alive
+    rclpy.init(context=context, domain_id=observer.node.context.get_domain_id())
+    client = Node("ending", context=context).create_client(Flatten, "silent")
+    wait_until(client.service_is_ready)
+    threading.Timer(0.2, context.try_shutdown).start()
+    with pytest.raises(ServiceCallError, match="cancelled"):
+        call(client, Flatten.Request(), timeout_s=10.0)
     release.set()
 
 

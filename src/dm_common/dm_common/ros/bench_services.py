@@ -135,7 +135,8 @@ class BenchServices:
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
             self.check_history()
             self._history_known = False
-            result = run_goal(self._degauss, goal, timeout, stop=stop, gone=self._driver.since_now())
+            gone = self._driver.since_now()
+            result = run_goal(self._degauss, goal, timeout, stop=stop, gone=gone, send_by=self.hold.command)
             if result.error_code != ErrorCode.OK and stop():
                 raise ServiceCallError("degauss: cancelled")
         self._check("degauss", result)
@@ -145,7 +146,7 @@ class BenchServices:
         with self._answered("set_signals", self._driver, self._set_signals.service_is_ready) as stop:
             # A driver that was just started again may not have discovered this client yet: what it is sent is lost.
             again = qos.RETURN_S if self._driver.changed_within(qos.APPEAR_S) else math.inf
-            response = call(self._set_signals, request, self._values["driver_timeout"], stop, again)
+            response = call(self._set_signals, request, self._values["driver_timeout"], stop, again, self.hold.command)
         self._check("set_signals", response)
         self._commanded = signals
         return np.array(response.applied) if len(response.applied) == len(signals) else signals
@@ -223,18 +224,18 @@ class BenchServices:
                 time.sleep(0.2)
 
     def rest_at_exit(self, signals: Floats) -> str:
-        """The same when this process's ROS context is already shut down: over one of its own."""
+        """The same when the process ends, over a ROS context of its own: nobody serves the node any more."""
+        self.hold.end()
         context = Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
         node = Node(f"{self._node.get_name()}_exit", context=context, use_global_arguments=False)
-        executor = SingleThreadedExecutor(context=context)
         try:
             client = node.create_client(SetSignals, self._set_signals.service_name)  # of this namespace, as remapped
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
                 return "the mirror could NOT be brought back to mid range: the driver does not answer"
             future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
-            rclpy.spin_until_future_complete(node, future, executor, timeout)
+            rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
             response = future.result() if future.done() else None
             if response is None or response.error_code != ErrorCode.OK:
                 reason = response.message if response else f"no answer within {timeout:g} s"
@@ -273,7 +274,7 @@ class BenchServices:
         try:
             yield lambda: self._stopping() or bool(gone())
         except ServiceCallError as error:
-            if self.cancelled():
+            if self.cancelled() or not self._node.context.ok():  # else the journal would hold a map that failed
                 raise Cancelled("cancelled") from error
             if self.hold.lost is not None:
                 raise self.hold.lost from error

@@ -13,7 +13,7 @@ from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import Cancelled, ErrorCode, Refusal
 
 #: How often a hold is renewed, s: several times within the driver's lease of 3 s.
 RENEW_S = 0.7
@@ -41,6 +41,7 @@ def call(
     timeout_s: float,
     cancelled: Callable[[], object] = lambda: False,
     again_s: float = math.inf,
+    send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
@@ -52,9 +53,11 @@ def call(
         timeout_s: longest wait for the server, and for its answer.
         cancelled: ends the wait.
         again_s: without an answer the request is sent again after so long, once; for one that may be carried out twice.
+        send_by: called with what sends the request, and returns what that does.
 
     Raises:
-        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
+        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, `cancelled()` became true, or the
+            process ends.
     """
     deadline = time.monotonic() + timeout_s
     while not client.service_is_ready():
@@ -72,15 +75,16 @@ def call(
         done.set()
 
     def send() -> Any:
-        future = client.call_async(request)
+        future = send_by(lambda: client.call_async(request))
         future.add_done_callback(answered)
         return future
 
     future, again = send(), time.monotonic() + again_s
     while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
-        if cancelled() or time.monotonic() > deadline:
+        ended = cancelled() or not client.context.ok()  # nobody takes an answer once the process ends
+        if ended or time.monotonic() > deadline:
             client.remove_pending_request(future)
-            reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
+            reason = "cancelled" if ended else f"no answer within {timeout_s:g} s"
             raise ServiceCallError(f"{client.srv_name}: {reason}")
         if time.monotonic() > again:
             client.remove_pending_request(future)
@@ -126,6 +130,7 @@ def run_goal(
     stop: Callable[[], bool] = lambda: False,
     gone: Callable[[], object] = lambda: False,
     identity: Any = None,
+    send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
     """Run a goal from a worker thread and return its result; one that is given up, be it by Ctrl-C, is cancelled first.
 
@@ -138,6 +143,7 @@ def run_goal(
         stop: cancels the goal; its result is waited for and returned all the same.
         gone: whether the server is known to be gone; then nobody waits for it.
         identity: of the goal, a unique_identifier_msgs/UUID; None = any.
+        send_by: called with what sends the goal, and returns what that does.
 
     Never call this from an executor callback: it would wait for itself.
 
@@ -157,7 +163,7 @@ def run_goal(
     wait(lambda: stop() or client.server_is_ready(), answer_s, "no such action", "; is its node running?")
     if stop() or gone():
         raise ServiceCallError(f"{name}: cancelled before it began; nothing has changed", ErrorCode.CANCELED)
-    accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
+    accepted = send_by(lambda: client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity))
     try:
         wait(accepted.done, answer_s, "no answer to the goal")
         finished = accepted.result().get_result_async()
@@ -197,6 +203,7 @@ class MirrorHolder:
         self._request = HoldMirror.Request(holder=name)
         self._renewal: Any = None
         self._one = threading.Lock()  # held with the mirror
+        self._sending, self._ended = threading.Lock(), False
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(RENEW_S, self._renew, clock=clock, autostart=False)
 
@@ -261,6 +268,19 @@ class MirrorHolder:
                 raise Refusal(ErrorCode.BUSY, busy)
             self.lost = Refusal(ErrorCode.PREEMPTED, "a newer run of the same node has taken the mirror over")
             time.sleep(0.02)
+
+    def command(self, send: Callable[[], Any]) -> Any:
+        """Call `send`, which sends a command, and return what it does. Raises Cancelled after `end`."""
+        with self._sending:
+            if self._ended:
+                raise Cancelled("cancelled: the process ends")
+            return send()
+
+    def end(self) -> bool:
+        """The process ends: no run sends a command after this call. Returns whether one has the mirror."""
+        with self._sending:
+            self._ended = True
+            return self._one.locked()
 
     def _ask(self, operation: int, timeout_s: float, cancelled: Callable[[], bool]) -> Any:
         self._request.operation = operation
