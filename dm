@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import runpy
+import shlex
 import shutil
 import signal
 import subprocess
@@ -92,6 +93,17 @@ def sourced_jazzy() -> bool:
     if os.environ.get("ROS_DISTRO") != "jazzy" or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
     return str(VENV) not in os.environ["AMENT_PREFIX_PATH"].split(os.pathsep)  # else this is a ./dm inside a ./dm exec
+
+
+def forget_other_ros() -> None:
+    """Leave the shell's other distribution of ROS 2 out of the search paths: it would stand in for the wheels."""
+    os.environ.pop("RMW_IMPLEMENTATION", None)  # the wheels have but one
+    others = tuple(filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
+    if str(VENV) in others:
+        return  # this is a ./dm inside a ./dm exec
+    for name in [name for name in os.environ if name.endswith("PATH") and name != "PATH"]:
+        entries = os.environ[name].split(os.pathsep)
+        os.environ[name] = os.pathsep.join(entry for entry in entries if not entry.startswith(others))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -198,7 +210,9 @@ def name_this_python(venv: Path) -> None:
 
 
 def stamped(stamp: Path, key: str) -> bool:
-    return stamp.is_file() and json.loads(stamp.read_text()).get("key") == key
+    with contextlib.suppress(ValueError):  # cut off by a power failure: as good as none
+        return stamp.is_file() and json.loads(stamp.read_text()).get("key") == key
+    return False
 
 
 def environment_is_ready() -> bool:
@@ -210,9 +224,11 @@ def set_up_environment() -> None:
     if environment_is_ready():
         return
     check_tools()
-    # A half-made environment is worthless, and one of other pins must not linger: begin anew.
-    if VENV.exists():
-        shutil.rmtree(VENV)
+    # A half-made environment is worthless, and one of other pins must not linger: begin anew. What was built belongs
+    # to the old one, and to the folder it was built in, which CMake writes to even from a copy elsewhere.
+    for folder in (VENV, ROOT / "build", ROOT / "install"):
+        if folder.exists():
+            shutil.rmtree(folder)
     log = ROOT / "log"
     extra = ["--system-site-packages"] if sourced_jazzy() else []
     run_logged([sys.executable, "-m", "venv", *extra, str(VENV)], log / "venv.log", "making .venv")
@@ -236,14 +252,15 @@ def set_up_environment() -> None:
 def build_key() -> str:
     """What needs a new colcon build when it changes.
 
-    Python sources, launch and configuration files are linked into the install space: of these only names count.
+    Python sources, launch and configuration files are linked into the install space: of these only names count, but
+    not those of the files that an editor has beside one that is open.
     """
     inputs = [path for kind in ("msg", "srv", "action") for path in (ROOT / "src" / "dm_msgs" / kind).glob(f"*.{kind}")]
     names = []
     for package in (ROOT / "src").iterdir():
         described = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
         inputs += [package / name for name in described if (package / name).is_file()]
-        names += [str(path) for folder in ("launch", "config") for path in (package / folder).rglob("*.*")]
+        names += [str(path) for folder in ("launch", "config") for path in (package / folder).rglob("[!.]*.*")]
     return digest(inputs) + hashlib.sha256("\0".join(sorted(names)).encode()).hexdigest()
 
 
@@ -259,7 +276,8 @@ def wheel_environment() -> dict[str, str]:
 def captured_environment() -> dict[str, dict[str, object]]:
     """What the set-up files of the workspace change, so that later runs need no shell: values, and entries of paths."""
     dump = "import json,os;print(json.dumps(dict(os.environ)))"
-    script = f"source '{ROOT}/install/setup.bash' >/dev/null 2>&1; exec '{PYTHON}' -c '{dump}'"
+    setup, python = shlex.quote(f"{ROOT}/install/setup.bash"), shlex.quote(str(PYTHON))
+    script = f"source {setup} >/dev/null 2>&1; exec {python} -c '{dump}'"
     output = subprocess.run(["bash", "-c", script], env=wheel_environment(), check=True, capture_output=True, text=True)
     volatile = {"_", "PWD", "OLDPWD", "SHLVL"}
     values: dict[str, object] = {}
@@ -289,6 +307,7 @@ def build_workspace() -> None:
     if workspace_is_ready():
         return
     check_tools()
+    BUILD_STAMP.unlink(missing_ok=True)  # when this is interrupted, nothing is ready for the sources of before either
     cmake = ["-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"] + ([] if sourced_jazzy() else ["-GNinja"])
     # By itself colcon lets a build wait for as long as the machine is busy with anything else.
     environment = {"MAKEFLAGS": f"-j{os.cpu_count() or 1}", **wheel_environment()}
@@ -340,6 +359,8 @@ def only_one() -> Iterator[None]:
 
 
 def main(arguments: list[str]) -> int:
+    if not sourced_jazzy():
+        forget_other_ros()
     if COMPLETION in os.environ:
         if not (environment_is_ready() and workspace_is_ready()):
             return 0  # no set-up at the press of a Tab key
@@ -349,13 +370,11 @@ def main(arguments: list[str]) -> int:
         return 0
     command, rest = arguments[0], arguments[1:]
     try:
-        if command == "doctor" and missing_tools():
-            check_tools()  # the full doctor needs the environment; without a compiler this is its answer
         if not (environment_is_ready() and workspace_is_ready()):
             with only_one():
                 set_up_environment()
                 build_workspace()
-    except SetupError as error:
+    except (SetupError, OSError, subprocess.SubprocessError) as error:  # a folder that is read-only, a full disk
         say(f"./dm: {error}")
         return 1
     except KeyboardInterrupt:

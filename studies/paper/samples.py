@@ -138,7 +138,7 @@ class Samples:
 
 
 class _MapKeepingBench(SimulatedBench):
-    """Keeps the latest map of each label, in single precision: rounding is some 1e-13 m."""
+    """Keeps the latest map of each sample surface, in single precision: rounding is some 1e-13 m."""
 
     def __init__(self, config: SimulationConfig) -> None:
         super().__init__(config)
@@ -151,7 +151,8 @@ class _MapKeepingBench(SimulatedBench):
 
     def measure(self, label: str) -> Measurement:
         measured = super().measure(label)
-        self.kept[label] = self._latest.astype(np.float32)
+        if label in TABLE_1:
+            self.kept[label] = self._latest.astype(np.float32)
         return measured
 
 
@@ -161,7 +162,7 @@ def measure_samples(
     """Measure Table 1 on a new simulation, with the pokes and reference frames of a full calibration, and judge them.
 
     Args:
-        every_pixel: judge the regions of Fig. 5 on all pixels too; all maps are in memory meanwhile.
+        every_pixel: judge the regions of Fig. 5 on all pixels too; all maps of them are in memory meanwhile.
 
     Raises:
         TooFewMapsError, ValueError: as the calibration and the region weights do.

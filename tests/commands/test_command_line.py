@@ -324,6 +324,13 @@ def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
     assert verb_status._calibration(Calibration()) == "none in use"
 
 
+def test_the_age_of_a_calibration_is_of_the_time_of_the_bench() -> None:
+    """In a simulation time begins at 0."""
+    made, state = Calibration(id="c"), ActuatorState()
+    made.header.stamp.sec, state.header.stamp.sec = 40, 100
+    assert "maps 60 s ago" in verb_status._calibration(made, state)
+
+
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
     said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))

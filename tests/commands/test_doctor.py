@@ -344,8 +344,10 @@ def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
     none = doctor_bench.stored_calibration(tmp_path, "T-1", MONTH_S)
     assert none is not None and none.note and "no calibration of the mirror T-1" in none.problem
     outcome = recorded(PlanKind.POKES, PlanOptions())[1]
-    calibration = calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("PDM_1", 10**18, ""))
-    CalibrationStore(tmp_path).save(calibration)
+    calibration = calibrate(
+        outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("PDM_1", time.time_ns())
+    )
+    CalibrationStore(tmp_path).save(calibration)  # made now, of maps of 1970
     serial = calibration.mirror_serial
     foreign = doctor_bench.stored_calibration(tmp_path, "other", MONTH_S)
     assert foreign is not None and f"those there are of {serial}" in foreign.problem

@@ -149,6 +149,13 @@ def test_regions_on_points_and_on_every_pixel_agree(made: tuple[Path, dict[str, 
     assert np.all(np.array(readings[LEVELLED]["mean_nm"]) < np.array(readings[POINTS]["mean_nm"]) + 1e-9)
 
 
+def test_only_maps_of_sample_surfaces_are_kept() -> None:
+    bench = samples._MapKeepingBench(SimulationConfig(pixels=64, samples=50))
+    for label in ("p03", "reference 1"):
+        bench.measure(label)
+    assert list(bench.kept) == ["p03"]
+
+
 def test_page_pictures_and_pdf_belong_together(made: tuple[Path, dict[str, Any]]) -> None:
     folder, figures = made
     page = (folder / "index.html").read_text()
@@ -161,6 +168,7 @@ def test_page_pictures_and_pdf_belong_together(made: tuple[Path, dict[str, Any]]
     for heading in ("Table 1", "Table 2", "Table 3", "Figs. 6 and 7", "Figs. 8 and 9", "Claims"):
         assert re.search(rf"<h2>{heading}", page), heading
     assert not re.search(r"https?://|\bnan\b", page)
+    assert "in readings other than “linear” divided by the number of candidates" in page
     # The paper's value and this run's stand in the same row.
     table = page[page.index("<caption>Table 3") :]
     for surface, models in figures["table3"].items():

@@ -133,6 +133,19 @@ def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn, str]) 
     page.enter("Curvature, 1/m", "0.0")
 
 
+def test_the_slider_takes_the_mouse(bench: tuple[Browser, StandIn, str]) -> None:
+    page = bench[0]
+    page.wait_for("Reachable -0.0500 to +0.0500 1/m")
+    slider, field = page.find("Curvature in 1 per metre", "div"), page.find("Curvature, 1/m", "input")
+
+    def clicked() -> bool:  # again, where the page has moved meanwhile
+        ActionChains(page.driver).move_to_element_with_offset(slider, slider.size["width"] // 4, 0).click().perform()
+        return 0.02 < float(field.get_attribute("value")) < 0.03
+
+    wait_until(clicked, 60, "the curvature where it was clicked")
+    page.enter("Curvature, 1/m", "0.0")
+
+
 def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
     for title in DETAILS:
         bench[0].unfold(title)

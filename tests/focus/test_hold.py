@@ -13,6 +13,7 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
+from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import Moment, Order, SendCommand
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
@@ -38,14 +39,15 @@ class Shape:
             perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().limits.pairs, 2.0)
         )
         self.planner = Planner(mirror, HysteresisFigures(law, 1e-9, 0.05))
-        self.hold = CreepHold(DEFAULTS | dict(values))
+        monitor = DriverMonitor(DEFAULTS)
+        self.hold = CreepHold(DEFAULTS | dict(values), monitor)
         state = law.demagnetised(37, 0.0)
         move = self.planner.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
         self.estimate = ActuatorEstimate(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
         self.signals, self.effective = move.plan.signals, move.effective
         active: Any = SimpleNamespace(planner=self.planner)
         self.order = Order(FocusRequest(), Moment(0, 0.0, 0.0), active, move, creep_held=True)
-        self.hold.order = self.order
+        monitor.order = self.order
         self.send(self.signals, 0.0, confirmed=True)
 
     def send(self, signals: np.ndarray, now: float, confirmed: bool) -> None:

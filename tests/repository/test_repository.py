@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
+import json
 import os
 import re
 import runpy
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rclpy.lifecycle import LifecycleNode
@@ -220,6 +222,62 @@ def test_a_missing_compiler_is_named_with_its_cure(tmp_path: Path) -> None:
     assert "C++ compiler" in done.stderr
     assert "sudo apt-get install g++" in done.stderr
     assert not (checkout / ".venv").exists()
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
+    checkout, environment = bare_machine(tmp_path)
+    (checkout / ".dm-lock").mkdir()
+    done = subprocess.run([sys.executable, checkout / "dm", "up"], env=environment, capture_output=True, text=True)
+    assert (done.returncode, "Traceback" in done.stderr) == (1, False)
+    assert str(checkout / ".dm-lock") in done.stderr
+
+
+def test_what_is_interrupted_or_from_elsewhere_is_not_taken_for_ready(tmp_path: Path) -> None:
+    place = tmp_path / "O'Neill's bench"
+    place.mkdir()
+    checkout, _ = bare_machine(place)
+    names = runpy.run_path(str(checkout / "dm"))["main"].__globals__
+    stamp, built = checkout / "install" / "dm-build.json", checkout / "build" / "dm_msgs"
+    built.mkdir(parents=True)
+    stamp.parent.mkdir()
+    (stamp.parent / "setup.bash").write_text("export ODD_PATH=/odd\n")
+    names["PYTHON"].parent.mkdir(parents=True)
+    names["PYTHON"].symlink_to(sys.executable)
+    assert names["captured_environment"]()["paths"]["ODD_PATH"] == ["/odd"]
+    (checkout / "src" / "dm_msgs" / "config").mkdir()
+    stamp.write_text(json.dumps({"key": names["workspace_key"]()}))
+    (checkout / "src" / "dm_msgs" / "config" / ".bench.yaml.swp").touch()
+    assert names["workspace_is_ready"](), "an editor has a file open"
+    stamp.write_text(stamp.read_text()[:40])
+    assert not names["workspace_is_ready"]()
+
+    def interrupted(*_arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    names |= {"run_logged": interrupted, "check_tools": lambda: None}
+    for step in ("build_workspace", "set_up_environment"):
+        with pytest.raises(KeyboardInterrupt):
+            names[step]()
+        assert not stamp.exists()
+    assert not built.exists(), "it belongs to another environment, or folder"
+
+
+def test_another_distribution_of_ros_does_not_stand_in_for_the_wheels(tmp_path: Path) -> None:
+    if runpy.run_path(str(ROOT / "dm"))["sourced_jazzy"]():
+        pytest.skip("there are no wheels here")
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "rclpy.py").write_text("raise ImportError('of another distribution')\n")
+    other = {"ROS_DISTRO": "kilted", "AMENT_PREFIX_PATH": str(tmp_path), "PYTHONPATH": str(tmp_path / "lib")}
+    subprocess.run(
+        [sys.executable, str(ROOT / "dm"), "exec", "python", "-c", "import rclpy; rclpy.init()"],
+        env=os.environ | other | {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+        check=True,
+    )
+
+
+def test_the_doctor_of_a_checkout_that_is_ready_asks_for_no_compiler() -> None:
+    command = [sys.executable, str(ROOT / "dm"), "doctor", "--help"]
+    subprocess.run(command, env=os.environ | {"PATH": ""}, check=True, capture_output=True)
 
 
 def test_help_needs_no_set_up(tmp_path: Path) -> None:

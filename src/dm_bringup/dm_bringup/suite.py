@@ -41,8 +41,8 @@ def load_config(path: Path, namespace: str = "") -> Config:
         content = yaml.safe_load(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not a YAML file: {error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a YAML file in UTF-8: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
     result: Config = {}

@@ -60,6 +60,9 @@ def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: 
     with file.open("a") as lines:
         lines.write("/**/pdm_driver: {ros__parameters: {volts.max: 200.0, simple: 2}}\n")
     assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0, "simple": 2}}
+    file.write_text("# 3 µm\n", encoding="latin-1")  # as some editors of Windows do
+    with pytest.raises(ConfigError, match=r"config\.yaml: not a YAML file in UTF-8"):
+        load_config(file)
 
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from dm_msgs.msg import Capabilities
 from reportlab.platypus import LongTable, Paragraph
+from scipy.optimize import linprog
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
@@ -36,6 +37,7 @@ from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.hysteresis.model import IN_USE, HysteresisModel
+from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.recipes import Recipe, RecipeBook
@@ -55,7 +57,8 @@ PLAY = HysteresisModel(
 def calibration() -> Calibration:
     _run, outcome = recorded(PlanKind.FULL, PlanOptions(), failing=frozenset({"poke+03"}))
     provenance = Provenance("bench_3", 1_700_000_000 * 10**9, "cold <morning> & windy")
-    return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=provenance)
+    made = calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=provenance)
+    return replace(made, maps=replace(made.maps, stamp_ns=made.maps.stamp_ns + provenance.created_ns))
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +106,7 @@ def test_the_page_says_what_was_measured_and_how_well(page: str, calibration: Ca
 def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibration: Calibration) -> None:
     assert "<tr><td>poke+03</td><td>no map within 5 s (2 tries)</td></tr>" in page
     text = page.replace("&#x27;", "'")
+    assert "held out, 95 % of the maps, with what hysteresis may add" in page
     for sentence in calibration.limitations:
         assert sentence.removeprefix("Poke check: ") in text
     assert "Not identified" in page
@@ -114,8 +118,34 @@ def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) ->
     assert f"{calibration.fit.held_out_max_zernike * 1e9:.2f} nm" in first and "95 % bound" in first
     assert "2023-12-14" in first, "valid for thirty days"
     low, high = curvatures(calibration)
-    assert -0.2 < low < -0.05 and 0.05 < high < 0.2 and f"{low:+.3f} to {high:+.3f} 1/m" in first
+    assert -0.3 < low < -0.2 and 0.2 < high < 0.3 and f"{low:+.3f} to {high:+.3f} 1/m" in first
     assert '<th scope="col">SHA' not in page[: page.index("<h2>Files")]
+
+
+def test_a_mirror_that_is_only_pulled_has_a_range(calibration: Calibration) -> None:
+    """Its figure is a bowl, deeper than its signals can flatten."""
+    fit = calibration.fit
+    low, high = curvatures(calibration)
+    bowl = np.where(np.arange(21) == 3, 12e-6, 0.0)
+    pulled = replace(calibration, fit=replace(fit, zernike_offset=fit.zernike_offset + bowl))
+    shift = 4.0 * 12e-6 / calibration.aperture_radius**2
+    assert low + shift > 0.0 and curvatures(pulled) == pytest.approx((low + shift, high + shift), abs=2e-3)
+
+
+def test_every_coefficient_of_a_sphere_in_the_range_can_be_reached(calibration: Calibration) -> None:
+    """A linear programme finds signals for the range told, and none for one that is 2 % wider."""
+    fit, (low, high) = calibration.fit, curvatures(calibration)
+    terms, offset = fit.influence_zernike[3:] * 1e6, fit.zernike_offset[3:] * 1e6
+    for curvature, within in ((low, True), (high, True), (1.02 * low, False), (1.02 * high, False)):
+        wanted = 1e6 * conic_coefficients(curvature, 0.0, calibration.aperture_radius)[3:] - offset
+        bounds = np.concatenate((wanted + 0.02, 0.02 - wanted))
+        found = linprog(np.zeros(37), np.vstack((terms, -terms)), bounds, bounds=(fit.signal_min, fit.signal_max))
+        assert found.success is within, curvature
+
+
+def test_a_calibration_made_of_old_maps_is_no_longer_valid_for_that(calibration: Calibration) -> None:
+    again = replace(calibration, created_ns=calibration.created_ns + 10**9 * 86400 * 300)
+    assert "2023-12-14" in html_page("", [certificate(again, {})])
 
 
 def test_a_figure_that_asks_too_much_of_neighbours_does_not_put_flat_out_of_reach(calibration: Calibration) -> None:
@@ -184,7 +214,7 @@ def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibrat
 
 def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[Check]:
     """A check every three days, whose error grows by `growth`, m a day."""
-    start, days = calibration.created_ns * 1e-9, 3.0 * np.arange(1, count + 1)
+    start, days = calibration.stamp_ns * 1e-9, 3.0 * np.arange(1, count + 1)
     scatter = 1e-10 * np.random.default_rng(0).standard_normal(count)
     return [
         Check(start + 86400.0 * day, 1, 1e-9 + growth * day + more, 1e-9, 1.0, 1e-3, 4, 2e-10 * day)
@@ -195,7 +225,7 @@ def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[C
 def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibration, tmp_path: Path) -> None:
     held_out = 5e-9 / IN_USE
     known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), held_out, 0.05, 120, ()))
-    start = known.created_ns * 1e-9
+    start = known.stamp_ns * 1e-9
     # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.
     for growth, days, reason in (
         (1e-10, 40.0, "the error grows by +3"),
@@ -276,17 +306,29 @@ def test_hysteresis_and_recipes_are_shown(calibration: Calibration) -> None:
 
 
 def test_a_play_operator_opens_the_loop_by_its_width() -> None:
-    assert loop_opening(PLAY) == pytest.approx(0.4 / 3.6)
-    assert loop_opening(HysteresisModel.linear()) == pytest.approx(0.0, abs=1e-12)
+    assert loop_opening(PLAY, -1.0, 1.0) == pytest.approx(0.4 / 3.6)
+    assert loop_opening(HysteresisModel.linear(), -1.0, 1.0) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_actuators_with_laws_of_their_own_have_loops_of_their_own(calibration: Calibration) -> None:
     share = np.linspace(0.5, 1.5, 37)
     own = replace(PLAY, play_weight=np.array([1.0, 0.0])[:, None] + share[:, None, None] * [[0.0], [1.0]])
-    np.testing.assert_allclose(loop_opening(own), 0.4 * share / (2.0 + 1.6 * share))
+    np.testing.assert_allclose(loop_opening(own, -1.0, 1.0), 0.4 * share / (2.0 + 1.6 * share))
     hysteresis = HysteresisFit("Preisach, each actuator its own", own, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
     text = html_page("", [content_hysteresis.hysteresis(replace(calibration, hysteresis=hysteresis))])
     assert "7.1% to 13.6% over the actuators" in text and "the mean over actuators" in text
+
+
+def test_a_loop_is_that_of_the_signals_seen(calibration: Calibration) -> None:
+    """Of a mirror of 0 .. 1, whose law is only known there: 0.4 of a span of 1 + 0.6."""
+    hysteresis = HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
+    seen = replace(calibration, hysteresis=hysteresis, fit=replace(calibration.fit, signal_min=0.0))
+    made = content_hysteresis.hysteresis(seen)
+    assert "25.0% of the span" in html_page("", [made])
+    assert figures_of(seen)["hysteresis"]["loop_opening"] == pytest.approx(0.25)
+    for axes in made.pictures[0].figure.axes:
+        drawn = np.concatenate([line.get_xdata() for line in axes.lines])
+        assert (drawn.min(), drawn.max()) == pytest.approx((0.0, 1.0))
 
 
 def test_creep_grows_by_its_rate_in_a_decade() -> None:

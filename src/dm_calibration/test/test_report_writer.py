@@ -36,7 +36,7 @@ def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration
     store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)
     writer.finish()
-    assert "<td>valid until</td><td>2001-09-16 " in (tmp_path / "c1.html").read_text()  # made on the ninth
+    assert "<td>valid until</td><td>1970-01-08 " in (tmp_path / "c1.html").read_text()  # measured on the first
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c1.h5", "c1.html", "c1.pdf"]
     assert published == [("report written: c1.html and .pdf beside the calibration", False)]
     assert [entry.id for entry in store.entries()] == ["c1"]

@@ -14,12 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState
 
 from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import DriverMonitor, same_signals
-from dm_controller.focus_types import Moment, Order, SendCommand
+from dm_controller.focus_types import Moment, SendCommand
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
@@ -35,79 +34,71 @@ class CreepHold:
 
     Args:
         values: parameters `hold.*`, live.
+        monitor: knows whose shape that is, and what the driver says.
 
     Attributes:
-        order: whose shape was commanded last; None = none was yet.
         corrections: sent so far.
         ended: the reason why the last hold ended.
     """
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = values
-        self.order: Order | None = None
+    def __init__(self, values: Mapping[str, Any], monitor: DriverMonitor) -> None:
+        self._values, self._monitor = values, monitor
         self.corrections = 0
         self.ended = ""
 
     @property
     def active(self) -> bool:
         """Whether a shape is held."""
-        return self.order is not None and self.order.creep_held
+        return self._monitor.order is not None and self._monitor.order.creep_held
 
     @property
     def next_check(self) -> float:
         """When a correction can be due, s; infinite without a shape to hold."""
-        order = self.order
+        order = self._monitor.order
         if order is None or order.command is None or not order.creep_held:
             return math.inf
         sent = order.command.sent.time
         return max(sent + self._values["hold.period"], order.checked + CHECK_SHARE * (order.checked - sent))
 
-    def begin(self, order: Order, monitor: DriverMonitor) -> None:
-        """From its command on `order` is the last one; the one before stands until the driver has taken that."""
-        if (before := monitor.order) is not None and before.command is not None:
-            order.stood = before if before.command.confirmed else before.stood
-        monitor.order = self.order = order
-
-    def not_taken(self, monitor: DriverMonitor) -> None:
+    def not_taken(self) -> None:
         """The driver has not taken the last command: what stood before it is held on, if it still stands."""
-        stood = monitor.stood
+        stood = self._monitor.stood
         self.end("the driver did not take the command")
         if stood is not None:
-            monitor.order = self.order = stood
+            self._monitor.order = stood
 
     def end(self, reason: str) -> None:
         """Leave the shape as it stands, and forget the one before."""
-        if self.order is not None:
-            self.order.stood = None
-            if self.order.creep_held:
-                self.order.creep_held, self.ended = False, reason
+        if (order := self._monitor.order) is not None:
+            order.stood = None
+            if order.creep_held:
+                order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
         """What the driver reports as its last request (N,) at `now` (s, steady): the hold ends when it is another's."""
-        command = self.order.command if self.order is not None else None
+        order = self._monitor.order
+        command = order.command if order is not None else None
         if command is None or same_signals(requested, command.signals):
             return
         if command.confirmed or now - command.sent.steady > CONFIRM_S:
             self.end("another command came")
 
-    def command(
-        self, report: ActuatorState | None, estimate: Callable[[float], ActuatorEstimate], now: Moment
-    ) -> SendCommand | None:
-        """What is due for the shape by the driver's last report; None = nothing yet.
+    def command(self, estimate: Callable[[float], ActuatorEstimate], now: Moment) -> list[SendCommand]:
+        """What is due for the shape by the driver's last report.
 
         `estimate` gives the actuators at a time, s.
         """
-        order = self.order
+        order, report = self._monitor.order, self._monitor.latest
         if order is None or not order.creep_held or report is None or report.moving:
-            return None
+            return []
         if report.holder not in ("", order.request.holder):
-            return None  # goes on afterwards, if they leave the shape as it is
+            return []  # goes on afterwards, if they leave the shape as it is
         signals = self.correction(estimate(now.time), now.time)
-        return None if signals is None else order.send_on(signals, now, report.turns)
+        return [] if signals is None else [order.send_on(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""
-        order, values = self.order, self._values
+        order, values = self._monitor.order, self._values
         if order is None or not order.creep_held or estimate.state is None:
             return None
         assert order.active is not None and order.move is not None and order.command is not None

@@ -61,8 +61,8 @@ class FocusController:
         self._values = values
         self.active: ActiveCalibration | None = None
         self.not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
-        self.observer, self.monitor, self.hold = HysteresisObserver(), DriverMonitor(values), CreepHold(values)
-        self.conditioning = Conditioning()
+        self.observer, self.monitor = HysteresisObserver(), DriverMonitor(values)
+        self.hold, self.conditioning = CreepHold(values, self.monitor), Conditioning()
         # What the last capabilities said of the driver, and the last estimate; and when the next is due, s, steady.
         self._reported: tuple[object, ...] = ()
         self._estimated: tuple[object, ...] = ()
@@ -77,8 +77,7 @@ class FocusController:
         """Use a dm_msgs/Calibration, with its dm_msgs/RecipeBook, if it belongs to the dm_msgs/MirrorInfo, None = not
         known; else refuse requests. Recipes of another calibration do not count.
         """
-        effects: list[Effect] = []
-        before = self.active
+        before, effects = self.active, list[Effect]()
         hold_tilt, axis = self._values["hold_tilt"], self._values["optical_axis"]
         try:
             active = active_calibration(calibration, mirror, hold_tilt, axis, recipes)
@@ -181,8 +180,7 @@ class FocusController:
         return choose_move(target, request.mode, budget, context)
 
     def _attempt(self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None) -> list[Effect]:
-        effects: list[Effect] = []
-        active = self.active
+        active, effects = self.active, list[Effect]()
         order.began, order.active, order.move = now, active, None
         order.unknown = (self._at_rest or self.observer).unknown
         order.creep_held = active is not None and self._values["hold.enable"] and active.planner.law.creep_rate > 0.0
@@ -217,14 +215,15 @@ class FocusController:
         return [Log("warning", f"refused: {refusal}"), PublishState(order)]
 
     def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
-        """The command of `move`, whose shape is to stand from now on."""
-        request = order.request
-        order.command = SendCommand(move.signals, now, 0, request.holder, request.take_over)
+        """The command of `move`, whose shape is to stand from now on; until the driver has it, the one before does."""
+        order.command = SendCommand(move.signals, now, 0, order.request.holder, order.request.take_over)
         order.checked = now.time
         effects: list[Effect] = [order.command]
-        if (before := self.monitor.order) is not None and not before.answered:
-            effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
-        self.hold.begin(order, self.monitor)
+        if (before := self.monitor.order) is not None and before.command is not None:
+            if not before.answered:
+                effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
+            order.stood = before if before.command.confirmed else before.stood
+        self.monitor.order = order
         return effects
 
     # --- a degauss on the way ---
@@ -233,8 +232,8 @@ class FocusController:
         """Have the mirror degaussed before `order` is carried out, unless it is already."""
         if not self.degauss_offered():
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "action degauss: pdm_driver does not offer it (yet)")
-        effects: list[Effect] = []
-        if (before := self.conditioning.wait(order)) is not None:
+        before, effects = self.conditioning.wait(order), list[Effect]()
+        if before is not None:
             before.pending = False
             refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
             effects += self._refuse(before, refusal, now)
@@ -276,12 +275,13 @@ class FocusController:
             effects += self._degauss_ended(now, failure)
         order = self.monitor.order
         if order is not None and (untaken := self.monitor.untaken(now.steady)) is not None:
-            self.hold.not_taken(self.monitor)
+            self.hold.not_taken()
             # A correction, or the end of a move, is no answer to the request.
             effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
-        report = None if self.conditioning.run else self.monitor.latest  # a correction would end a degauss
-        correction = self.hold.command(report, self.observer.estimate, now)
-        return [*effects, *self._news(now), *([] if correction is None else [correction])]
+        effects += self._news(now)
+        if not self.conditioning.run:  # a correction would end the degauss
+            effects += self.hold.command(self.observer.estimate, now)
+        return effects
 
     def quick_ticks(self, now: Moment) -> bool:
         """Whether something can be due before `SLOW_PERIOD_S` has passed."""

@@ -35,7 +35,7 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import HysteresisObserver
 from dm_common.messages import applied_from, estimate_from, estimate_message
 from dm_common.optics.zernike import basis
-from dm_tools.console import status, view_models
+from dm_tools.console import console_node, status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
 from dm_tools.console.charts.plots import INK, SAG_COLOURS, heat_map, loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import ConsoleNode, Snapshot
@@ -107,7 +107,8 @@ def test_cells_without_a_command_have_no_signal() -> None:
 
 def test_the_command_map_has_every_actuator_where_it_is() -> None:
     found = view_models.cells(mirror_info(), state([0.0] * COUNT), None)
-    drawing = command_map(found, 3, 11.0, -1.0, 1.0)
+    drawing = command_map(found, 3, 11.0, -0.25, 1.0)
+    assert drawing.options["visualMap"]["text"] == ["+1", "signal -0.25"]
     cells, circle = drawing.options["series"]
     assert sorted(number for _x, _y, number in (item["value"] for item in cells["data"])) == list(range(1, COUNT + 1))
     assert cells["data"][-1]["value"][2] == 3  # drawn last: nothing covers its outline
@@ -255,20 +256,26 @@ def test_the_page_says_where_the_mirror_stands() -> None:
 
 @pytest.mark.parametrize(("namespace", "own"), [("left", "left/"), ("", "")])
 def test_the_nodes_of_another_mirror_are_not_taken_for_those_of_this_one(
-    observer: Observer, domain: int, namespace: str, own: str
+    observer: Observer, domain: int, namespace: str, own: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = ConsoleNode(namespace, domain)
     publisher = observer.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
     names = ("left/focus_controller", "right/pdm_driver", "pdm_driver", "left/calibration", "interferometer")
-    statuses = [DiagnosticStatus(name=name, message=name) for name in names]
+    statuses = DiagnosticArray(status=[DiagnosticStatus(name=name, message=name) for name in names])
+    robot = DiagnosticArray(status=[DiagnosticStatus(name="robot/arm")])  # whose time is another
+    statuses.header.stamp.sec, robot.header.stamp.sec = 50, 10**9
 
     def heard() -> bool:
-        publisher.publish(DiagnosticArray(status=statuses))
-        return len(node.snapshot().diagnostics) == len(names)
+        publisher.publish(statuses)
+        publisher.publish(robot)
+        return len(node.snapshot().diagnostics) == len(names) + 1
 
     try:
         wait_until(heard, 30.0)
         health = node.snapshot().health
+        assert node.snapshot().bench_time == 50.0
+        monkeypatch.setattr(console_node, "SILENCE_S", -1.0)
+        assert {each.level for each in node.snapshot().diagnostics.values()} == {DiagnosticStatus.STALE}
     finally:
         node.close()
     of_it = [name.removeprefix(own) for name in names if name.rpartition("/")[0] == namespace]

@@ -1,9 +1,13 @@
 """Ports and folder of a virtual bench."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
+from dm_tools.demo import figures
 from dm_tools.demo.demo_bench import free_ports, make_empty, usable_folder
 
 
@@ -12,7 +16,7 @@ def test_ports_that_nobody_has_bound_yet_are_not_handed_out_again() -> None:
     assert len(set(drawn)) == len(drawn)
 
 
-def test_a_demo_empties_its_own_folder_and_no_other(tmp_path: Path) -> None:
+def test_a_demo_empties_its_own_folder_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mine, made, empty = (tmp_path / name for name in ("mine", "made", "empty"))
     for folder in (mine, empty):
         folder.mkdir()
@@ -24,6 +28,29 @@ def test_a_demo_empties_its_own_folder_and_no_other(tmp_path: Path) -> None:
     for folder in (made, empty):
         make_empty(usable_folder(folder))
         (folder / "result.json").touch()
-        make_empty(usable_folder(folder))
-        assert sorted(path.name for path in folder.iterdir()) == [".dm_demo", "maps"]
+        monkeypatch.chdir(folder)
+        make_empty(usable_folder(Path()))
+        assert sorted(path.name for path in Path.cwd().iterdir()) == [".dm_demo", "maps"]
     assert (mine / "thesis.tex").read_text() == "years"
+
+
+def test_the_columns_of_the_picture_go_over_the_range_of_any_mirror(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
+    draw = figures.draw_command
+
+    def spy(axes: Any, *others: Any) -> Any:
+        titles.append(axes.get_title())
+        return draw(axes, *others)
+
+    monkeypatch.setattr(figures, "draw_command", spy)
+    sag = np.add.outer(np.arange(8.0) ** 2, np.arange(8.0)) * 1e-9
+    info = SimpleNamespace(pitch=1e-3, centre_x=3.5, centre_y=3.5, width=8, height=8, aperture_radius=4e-3)
+    prediction = SimpleNamespace(signals=np.zeros(2), predicted_rms=1e-9)
+    error = SimpleNamespace(residual=sag, rms=1e-9, max_zernike=1e-9)
+    row = {"prediction": prediction, "sag": sag, "info": info, "error": error}
+    rows = [row | {"curvature": round(0.005 + 0.0025 * step, 4)} for step in range(11)]  # a membrane is always hollow
+    mirror = SimpleNamespace(actuator_x=[0.0, 1e-3], actuator_y=[0.0, 0.0])
+    assert figures.save_sweep_figure(rows, tmp_path / "demo.png", "membrane", mirror).is_file()
+    assert titles == [f"{curvature} 1/m" for curvature in ("+0.005", "+0.0125", "+0.0175", "+0.0225", "+0.03")]

@@ -119,7 +119,7 @@ def readings(results: Results) -> Section:
             "another G / weighted response / WLS / all regions",
             "G by weighted sag fit, and WLS",
         ),
-        ("stepwise thresholds", "not given", "0.05 to enter, 0.10 to leave"),
+        ("stepwise thresholds", "not given", "linear: 0.05 to enter, 0.10 to leave; else over the candidates"),
         ("candidates", "linear / with a predicted error", "history; linear beside it"),
         ("c_ini of section 3.2", "stored / measured before the move", "both run; measured shown"),
         ("“1st–6th order”", "orders 1–6 / six orders n = 0 … 5", "n = 0 … 5, judged beyond tilt"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE
 from dm_calibration.report.document import Picture, Section, Table
 from studies.paper import reported
 from studies.paper.page.figures import predictions_figure
@@ -43,8 +44,9 @@ def table_2(results: Results) -> Section:
         "Table 2: significance of the regressions",
         [
             "Response: rms surface control error of p01–p58 over the whole aperture; 50 surfaces train, eight test. "
-            "Selection: stepwise, p to enter 0.05, p to remove 0.10 (the paper names no thresholds). n and k are not "
-            "in the paper's table; those in brackets are the only ones that its adjusted R², F and p agree with.",
+            f"Selection: stepwise, p to enter {P_ENTER:.2f}, p to remove {P_REMOVE:.2f} (the paper names none), in "
+            f"readings other than “{Reading.LINEAR.value}” divided by the number of candidates. n and k are not in "
+            "the paper's table; those in brackets are the only ones that its adjusted R², F and p agree with.",
             f"To the letter (“{Reading.LINEAR.value}”: 37 signals and 21 coefficients), AZreg gives an adjusted R² of "
             f"{plain.adjusted_r2:.2f}, the paper {reported.TABLE_2['AZreg'].adj_r2:.2f}. An rms error is a norm, and "
             "almost no linear function of signals or coefficients: each surface predicted by a model selected without "

@@ -10,25 +10,26 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
 from dm_calibration.report.checks import DEFAULTS, valid_until
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
+from dm_common.bounded import BoundedProgramme
 from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.law_shape import certain_limits
 from dm_common.limits import Limits
-from dm_common.mirror import Mirror
-from dm_common.optics.conic import conic_coefficients, conic_sag
+from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.zernike import PISTON_TILT
 
 #: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
 PEOPLE = Path("~/.ros/dm_report.json")
 #: A curvature is in the range while no coefficient is further off than this, m; it is found to this, 1/m.
 TOLERANCE, STEP = 20e-9, 1e-4
+#: Weight of the signals beside the coefficients, relative: makes the signals of more actuators than terms definite.
+RIDGE = 1e-9
 
 
 def people(file: Path = PEOPLE) -> dict[str, str]:
@@ -52,34 +53,32 @@ def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
 
 def curvatures(calibration: Calibration) -> tuple[float, float]:
     """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach whatever the actuators went
-    through before; (nan, nan) = not even 0.
+    through before; (nan, nan) = neither 0 nor that in mid range.
     """
     fit, maps, radius = calibration.fit, calibration.maps, calibration.aperture_radius
-    x, y = calibration.actuator_x, calibration.actuator_y
-    pairs = neighbour_pairs(x, y)
+    pairs = neighbour_pairs(calibration.actuator_x, calibration.actuator_y)
     apart = float(np.abs(maps.applied[:, pairs[:, 0]] - maps.applied[:, pairs[:, 1]]).max(initial=1e-6))
     limits = Limits(fit.signal_min, fit.signal_max, pairs, apart)
     if calibration.hysteresis is not None:
         limits = certain_limits(calibration.hysteresis.law, limits)
-    mirror = Mirror(calibration.mirror_name, calibration.mirror_serial, x, y, radius, limits)
+    terms, offset = fit.influence_zernike[PISTON_TILT:], fit.zernike_offset[PISTON_TILT:]
+    programme = BoundedProgramme(terms, limits, RIDGE * float(np.square(terms).sum()))
 
     def reached(curvature: float) -> bool:
-        sag = conic_sag(radius * fit.points.x, radius * fit.points.y, curvature)
-        signals, _left = solve_shape(sag, fit, mirror, limits)
-        error = fit.influence_zernike @ signals + fit.zernike_offset - conic_coefficients(curvature, 0.0, radius)
-        return bool(np.abs(error[PISTON_TILT:]).max() <= TOLERANCE)
+        wanted = conic_coefficients(curvature, 0.0, radius)[PISTON_TILT:] - offset
+        return bool(np.abs(terms @ programme.solve(wanted) - wanted).max() <= TOLERANCE)
 
-    def edge(far: float) -> float:
-        near = 0.0
+    def edge(near: float, far: float) -> float:
         while abs(far - near) > STEP:
             middle = 0.5 * (near + far)
             near, far = (middle, far) if reached(middle) else (near, middle)
         return near
 
-    if not reached(0.0):
-        return (np.nan, np.nan)
-    stroke = 4.0 * (limits.high - limits.low) * float(np.abs(fit.influence_zernike[PISTON_TILT]).sum()) / radius**2
-    return edge(-stroke), edge(stroke)
+    # A mirror that is only pulled does not reach 0.
+    hollow = 4.0 / radius**2 * float(offset[0] + limits.middle * terms[0].sum())
+    start = next(filter(reached, (0.0, hollow)), np.nan)
+    stroke = 4.0 / radius**2 * (limits.high - limits.low) * float(np.abs(terms[0]).sum())
+    return (edge(start, start - stroke), edge(start, start + stroke))
 
 
 def certificate(
@@ -100,7 +99,7 @@ def certificate(
     reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]
     bound = length(calibration.promise, calibration.wavelength)
     low, high = curvatures(calibration)
-    until, reason = valid_until(checks, calibration.promise, calibration.created_ns * 1e-9, values)
+    until, reason = valid_until(checks, calibration.promise, calibration.stamp_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0

@@ -24,7 +24,7 @@ DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS if par
 
 
 def valid_until(
-    checks: Sequence[Check], promised: float, created_s: float, values: Mapping[str, Any] = DEFAULTS
+    checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = DEFAULTS
 ) -> tuple[float, str]:
     """Until when a calibration is valid, s since the epoch, and why; the next is to be made by then.
 
@@ -33,11 +33,11 @@ def valid_until(
     Args:
         checks: oldest first.
         promised: 95 % bound on the largest coefficient error, m.
-        created_s: when the calibration was made.
+        measured_s: time of the last map of the calibration.
         values: of the parameters JUDGED_BY.
     """
     agreed = [check.time for check in checks if check.accepted]
-    stale = max([created_s, *agreed]) + values["updates.stale_after"]
+    stale = max([measured_s, *agreed]) + values["updates.stale_after"]
     if len(checks) < TREND_MIN or checks[-1].time - checks[0].time < TREND_SPAN_S:
         return stale, "too few checks to see a trend; a check that agrees puts it off"
     time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
@@ -58,9 +58,9 @@ def checks_section(calibration: Calibration, checks: Sequence[Check], values: Ma
         checks: at least one, oldest first.
         values: of the parameters JUDGED_BY.
     """
-    last, created, promised = checks[-1], calibration.created_ns * 1e-9, calibration.promise
-    days = max(last.time - created, 1.0) / DAY_S
-    until, reason = valid_until(checks, promised, created, values)
+    last, measured, promised = checks[-1], calibration.stamp_ns * 1e-9, calibration.promise
+    days = max(last.time - measured, 1.0) / DAY_S
+    until, reason = valid_until(checks, promised, measured, values)
     outside = sum(check.max_zernike > promised for check in checks)
     sentences = [
         f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "
@@ -83,15 +83,15 @@ def checks_section(calibration: Calibration, checks: Sequence[Check], values: Ma
     ]
     header = ("map", "agreed", "largest coefficient, nm", "surprise", "gains (actuator)", "figure, nm rms")
     picture = Picture(
-        "checks", "Checks since the calibration; dashed: what it promises.", _chart(checks, promised, created)
+        "checks", "Checks since the calibration; dashed: what it promises.", _chart(checks, promised, measured)
     )
     return Section("Checks since then", sentences, [Table("The last checks", header, rows)], [picture])
 
 
-def _chart(checks: Sequence[Check], promised: float, created: float) -> Figure:
+def _chart(checks: Sequence[Check], promised: float, measured: float) -> Figure:
     figure = Figure(figsize=(7.5, 3.2), layout="constrained")
     axes = figure.subplots()
-    days = np.array([(check.time - created) / DAY_S for check in checks])
+    days = np.array([(check.time - measured) / DAY_S for check in checks])
     agreed = np.array([bool(check.accepted) for check in checks])
     error = np.array([check.max_zernike for check in checks]) * NM
     axes.plot(days[agreed], error[agreed], "o", color=BLUE, label="largest coefficient error")

@@ -42,10 +42,14 @@ def summary(calibration: Calibration) -> Section:
     recipes = [recipe.max_zernike for recipe in calibration.recipes.recipes]
     remeasured = length(max(recipes), wavelength) if recipes else "not measured"
     move = "largest coefficient error of a move in open loop, held out, 95 %"
+    allowed = ", with what hysteresis may add" if hysteresis is None else ""
     rows = [
         ("residual sag of the maps used, in-sample", length(fit.in_sample_rms, wavelength)),
         ("residual sag of maps held out of the fit", length(fit.held_out_rms, wavelength)),
-        ("largest coefficient error, held out, 95 % of the maps", length(fit.held_out_max_zernike, wavelength)),
+        (
+            f"largest coefficient error, held out, 95 % of the maps{allowed}",
+            length(fit.held_out_max_zernike, wavelength),
+        ),
         *([(move, length(hysteresis.held_out_max_zernike, wavelength))] if hysteresis is not None else []),
         ("largest coefficient error, re-measured (recipes)", remeasured),
         ("figure drift during the run, rms", length(fit.drift_rms, wavelength)),

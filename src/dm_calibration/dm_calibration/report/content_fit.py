@@ -99,6 +99,6 @@ def coefficients(calibration: Calibration, left: Residuals) -> Section:
         )
     else:
         bound = calibration.fit.held_out_max_zernike * NM
-        text += f"Held out, the largest of a map stays below {bound:.2f} nm in 95 % of the maps."
+        text += f"Held out, with what hysteresis may add, the largest stays below {bound:.2f} nm in 95 % of the maps."
     picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(left, sigma))
     return Section("Zernike coefficients", [text], [Table("Residual by coefficient", header, rows)], [picture])

@@ -11,7 +11,7 @@ from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook, recipe_row
 
-#: Minor loops: from the falling branch, down to each of these and back.
+#: Minor loops: from the falling branch, down to each of these and back, as shares of half the range.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
 MINOR_DEPTH = 0.5
 #: Times after a step, s.
@@ -20,9 +20,9 @@ CREEP_TIMES = np.geomspace(0.1, 1e5, 61)
 CREEP_FROM = 1.0
 
 
-def loop_opening(law: HysteresisModel) -> Floats:
-    """(N,) largest distance of the branches of the full cycle, as a share of its span, of each law that there is."""
-    return opening(*closed_cycle(law)[1:])
+def loop_opening(law: HysteresisModel, low: float, high: float) -> Floats:
+    """(N,) largest distance of the branches of a cycle of `low` .. `high`, as a share of its span, of each law."""
+    return opening(*closed_cycle(law, low, high)[1:])
 
 
 def step_response(law: HysteresisModel, time: Floats) -> Floats:
@@ -35,31 +35,32 @@ def step_response(law: HysteresisModel, time: Floats) -> Floats:
     return np.asarray(grown / law.effective(law.advance(state, CREEP_FROM)).mean())
 
 
-def loops_figure(law: HysteresisModel) -> Figure:
-    """The major loop with minor loops in it; beside it what remains without the straight line.
+def loops_figure(law: HysteresisModel, low: float, high: float) -> Figure:
+    """The loop of `low` .. `high` with minor loops in it; beside it what remains without the straight line.
 
     The mean over actuators whose laws are their own.
     """
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    signals, rising, falling = closed_cycle(law)
-    slope = (rising[-1] - rising[0]).mean() / 2.0
-    middle = 0.5 * (rising[-1] + rising[0]).mean()
+    signals, rising, falling = closed_cycle(law, low, high)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    ends = rising[[0, -1]].mean(axis=1)
     ways: list[tuple[Floats, Floats, str, str]] = [
         (signals, rising, VERMILION, "rising"),
         (signals, falling, BLUE, "falling"),
     ]
-    for turn in MINOR_TURNS:
-        state = turned(law, (1.0, -1.0, 1.0, turn))
-        for end in (turn + MINOR_DEPTH, turn):
-            there, values, state = branch(law, state, min(end, 1.0))
-            ways.append((there, values, GREY, "minor loops" if turn == MINOR_TURNS[0] and end != turn else ""))
-    there, values, _ = branch(law, turned(law, ()), 1.0)
+    for number, turn in enumerate(centre + half * np.array(MINOR_TURNS)):
+        state = turned(law, (high, low, high, turn), centre)
+        for end in (min(turn + half * MINOR_DEPTH, high), turn):
+            there, values, state = branch(law, state, end)
+            ways.append((there, values, GREY, "" if number or end == turn else "minor loops"))
+    there, values, _ = branch(law, turned(law, (), centre), high)
     ways.append((there, values, GREEN, "first rise after a degauss"))
     for there, own, colour, label in ways:
         values = own.mean(axis=1)
         left.plot(there, values, color=colour, linewidth=1.2, label=label or None)
-        right.plot(there, 100 * (values - middle - slope * there) / (2.0 * slope), color=colour, linewidth=1.2)
+        straight = np.interp(there, (low, high), ends)
+        right.plot(there, 100 * (values - straight) / np.ptp(ends), color=colour, linewidth=1.2)
     left.set(xlabel="applied signal", ylabel="effective signal")
     right.set(xlabel="applied signal", ylabel="departure from the straight line, % of the span")
     left.legend(fontsize=8)
@@ -108,14 +109,15 @@ def hysteresis(calibration: Calibration) -> Section:
         )
         return Section(title, [text])
     law, bound = hysteresis.law, length(hysteresis.held_out_max_zernike, calibration.wavelength)
-    openings = loop_opening(law)
+    seen = calibration.fit.signal_min, calibration.fit.signal_max
+    openings = loop_opening(law, *seen)
     spread = f", {openings.min():.1%} to {openings.max():.1%} over the actuators" if law.actuators else ""
     shared = "the mean over actuators, whose laws are their own" if law.actuators else "all actuators share it"
     hour, day = 100 * (step_response(law, np.array([3600.0, 86400.0])) - 1.0)
     rows = [
         ("class of law", hysteresis.name),
         ("maps it was identified from", str(hysteresis.maps)),
-        ("opening of the full loop", f"{openings.mean():.1%} of the span{spread}"),
+        ("opening of the loop over the signals seen", f"{openings.mean():.1%} of the span{spread}"),
         ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
         ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
         ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),
@@ -123,7 +125,7 @@ def hysteresis(calibration: Calibration) -> Section:
         ("standard deviation of an effective signal when the history is unknown", f"{hysteresis.unknown_sigma:.3f}"),
     ]
     caption = f"Loops of the identified law: {shared}; gains are in the influence function."
-    pictures = [Picture("loops", caption, loops_figure(law))]
+    pictures = [Picture("loops", caption, loops_figure(law, *seen))]
     if law.creep_rate > 0.0:
         caption = "Creep of the identified law after a step on a rested mirror."
         pictures.append(Picture("creep", caption, creep_figure(law)))

@@ -110,7 +110,7 @@ def figures_of(calibration: Calibration) -> dict[str, Any]:
         result["hysteresis"] = {
             "law": hysteresis.name,
             "held_out_max_zernike_nm": hysteresis.held_out_max_zernike * 1e9,
-            "loop_opening": float(loop_opening(hysteresis.law).mean()),
+            "loop_opening": float(loop_opening(hysteresis.law, fit.signal_min, fit.signal_max).mean()),
             "creep_per_decade": hysteresis.law.creep_rate,
         }
     return result

@@ -21,8 +21,10 @@ from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
+from dm_common.ros.lifecycle import STALE
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
+from dm_tools.running_suite import NEEDED
 
 TOPICS = client.TOPICS | {
     "actuator_estimate": (ActuatorEstimate, qos.LATCHED),
@@ -54,7 +56,7 @@ class Snapshot:
 
     Attributes:
         calibration: in use; None = none is, or none was heard.
-        diagnostics: {node: latest status}, of this namespace's nodes and others.
+        diagnostics: {node: latest status}, of this namespace's nodes and others; STALE = no longer heard.
         health: the same of the nodes of this namespace that were heard lately, by their names without it.
         bench_time: s, ROS time as far as heard.
     """
@@ -89,6 +91,7 @@ class ConsoleNode:
         self._prefix = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
         self._diagnostics: dict[str, tuple[DiagnosticStatus, float]] = {}  # and when they were heard
         self._bench_time = 0.0
+        self._timed = {f"{self._prefix}{name}" for name in NEEDED}  # others, and the simulation, may have another time
         self._stops: dict[str, threading.Event] = {}  # of the goals that run; once set they are cancelled
         self.observer = StateObserver()
         self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
@@ -110,9 +113,10 @@ class ConsoleNode:
             self.observer.use(message)
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        time_s = seconds(message.header.stamp)
-        restarted = time_s < self._bench_time - TIME_JUMP_S
-        self._bench_time = time_s if restarted else max(self._bench_time, time_s)
+        if self._timed.intersection(status.name for status in message.status):
+            time_s = seconds(message.header.stamp)
+            restarted = time_s < self._bench_time - TIME_JUMP_S
+            self._bench_time = time_s if restarted else max(self._bench_time, time_s)
         for status in message.status:
             self._diagnostics[status.name] = status, time.monotonic()
 
@@ -141,7 +145,10 @@ class ConsoleNode:
             del messages["calibration"]
         return Snapshot(
             **messages,
-            diagnostics={name: status for name, (status, _when) in diagnostics.items()},
+            diagnostics={
+                name: status if when >= recent else DiagnosticStatus(level=STALE, name=name, message="no longer heard")
+                for name, (status, when) in diagnostics.items()
+            },
             health=health,
             bench_time=self._bench_time,
         )

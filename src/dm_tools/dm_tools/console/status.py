@@ -63,7 +63,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
         if calibration.hysteresis.play_radius:
             shown.append(Badge("history: not known", "doubt") if doubt else Badge("history: known"))
     worst = max((ord(bytes(status.level)) for status in snapshot.health.values()), default=0)
-    if worst and worst != ord(DiagnosticStatus.STALE):
+    if worst:
         text = LEVELS.get(bytes([worst]), "?")
         shown.append(Badge(f"diagnostics: {text}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
     return shown

@@ -120,11 +120,12 @@ def usable_folder(path: Path) -> Path:
 
 
 def make_empty(folder: Path) -> None:
-    """Make `folder`, see `usable_folder`, anew; what a demo before has left is gone."""
-    if folder.exists():
-        shutil.rmtree(folder)
-    (folder / "maps").mkdir(parents=True)
+    """Empty `folder`, see `usable_folder`, or make it; itself it stays, for it may be a mount, or where one stands."""
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).write_text("made by dm demo, which empties this folder when it begins\n")
+    for path in (path for path in folder.iterdir() if path.name != MARK):
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+    (folder / "maps").mkdir()
 
 
 @contextlib.contextmanager

@@ -17,8 +17,8 @@ from matplotlib.patches import Circle, RegularPolygon
 from dm_common.optics.piston_tilt import remove_plane
 from dm_tools.output import WAVELENGTH
 
-#: Curvatures shown as columns: the ends, half way and flat.
-COLUMNS = (-0.05, -0.02, 0.0, 0.02, 0.05)
+#: Shares of the sweep shown as columns: its ends, its middle and in between.
+COLUMNS = (0.0, 0.3, 0.5, 0.7, 1.0)
 
 
 def draw_command(axes: Axes, signals: np.ndarray, positions: np.ndarray, aperture_radius: float) -> Any:
@@ -59,7 +59,7 @@ def save_sweep_figure(
     """
     positions = np.column_stack([mirror.actuator_x, mirror.actuator_y])
     curvatures = np.array([row["curvature"] for row in rows])
-    shown = [rows[int(np.abs(curvatures - wanted).argmin())] for wanted in COLUMNS]
+    shown = [rows[round(share * (len(rows) - 1))] for share in COLUMNS]
     figure = plt.figure(figsize=(13, 11), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(4, len(shown), height_ratios=(1, 1, 1, 0.9))
@@ -69,7 +69,7 @@ def save_sweep_figure(
     for column, (row, sag) in enumerate(zip(shown, measured_sag, strict=True)):
         axes = [figure.add_subplot(grid[line, column]) for line in range(3)]
         info = row["info"]
-        axes[0].set_title(f"{row['curvature']:+.2f} 1/m", fontsize=10)
+        axes[0].set_title(f"{row['curvature']:+g} 1/m", fontsize=10)
         command = draw_command(axes[0], row["prediction"].signals, positions, info.aperture_radius)
         measured = draw_map(axes[1], sag * 1e6, info, sag_limit, "viridis")
         residual = draw_map(axes[2], row["error"].residual * 1e9, info, residual_limit, "PuOr")

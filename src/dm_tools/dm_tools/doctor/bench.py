@@ -198,7 +198,7 @@ def writable_folder(folder: Path) -> Finding | None:
 
 
 def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding | None:
-    """Whether there is a readable calibration of this mirror, made or agreed with in the last `stale_after`, s."""
+    """Whether there is a readable calibration of this mirror, measured or agreed with in the last `stale_after`, s."""
     from dm_calibration.recalibration.check_log import SUFFIX, read_checks
     from dm_calibration.store.calibration_store import CalibrationStore
 
@@ -217,7 +217,7 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
     last = store.last_in_use(serial)
     used = next((one for one in own if one.id == last), own[0])
     agreed = [check.time for check in read_checks(folder / f"{used.id}{SUFFIX}") if check.accepted]
-    checked = max([used.created_ns * 1e-9, *agreed])
+    checked = max([used.stamp_ns * 1e-9, *agreed])
     days = (time.time() - checked) / DAY_S
     if days * DAY_S > stale_after:
         return Finding(

@@ -43,7 +43,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
-        "calibration": _calibration(heard),
+        "calibration": _calibration(heard, state),
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),
@@ -89,10 +89,11 @@ def _now(by: str, shape: SettledShape | None, state: Any) -> str:
     return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature: without a bound{moving}"
 
 
-def _calibration(calibration: Any) -> str:
+def _calibration(calibration: Any, state: Any = None) -> str:
+    """The calibration in a line; its age by the last report of the driver, for the bench may have a time of its own."""
     if calibration is None or not calibration.id:
         return "not heard" if calibration is None else "none in use"
-    age = time.time() - calibration.header.stamp.sec
+    age = (time.time() if state is None else state.header.stamp.sec) - calibration.header.stamp.sec
     doubtful = sum(grade != "good" for grade in calibration.actuator_grade)
     law = f"law {calibration.hysteresis.law}" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
     return (

@@ -69,7 +69,7 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
         visualMap={
             "min": low,
             "max": high,
-            "text": [f"{high:+.1f}", f"signal {low:+.1f}"],
+            "text": [f"{high:+g}", f"signal {low:+g}"],
             "textStyle": {"color": INK},
             "orient": "horizontal",
             "left": "center",

@@ -141,7 +141,7 @@ class ActuatorCards:
         self._picture.show(command_map(self._cells, session.chosen, radius, mirror.signal_min, mirror.signal_max))
         cell, state = self._cells[session.chosen - 1], snapshot.actuator_state
         volts = f", {state.volts[session.chosen - 1]:.1f} V" if state is not None and len(state.volts) else ""
-        limits = f"limits {mirror.signal_min:+.1f} to {mirror.signal_max:+.1f}"
+        limits = f"limits {mirror.signal_min:+g} to {mirror.signal_max:+g}"
         self._text.show(f"{cell.text[0].upper()}{cell.text[1:]}{volts}; {limits}.")
         self._show_loop(snapshot)
 

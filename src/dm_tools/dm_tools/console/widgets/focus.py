@@ -113,8 +113,9 @@ class FocusCard:
         )
         if found != self._range:
             self._range = found
-            low, high = math.ceil(found[0] / STEP) * STEP, math.floor(found[1] / STEP) * STEP
-            self._slider.props(f"min={low:.4f} max={high:.4f}")
+            # As numbers: what `props()` reads from a text is text to the browser, whose slider then ignores the mouse.
+            self._slider.props["min"] = round(math.ceil(found[0] / STEP) * STEP, 4)
+            self._slider.props["max"] = round(math.floor(found[1] / STEP) * STEP, 4)
 
     async def _predict(self) -> None:
         try:
