@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, console, progress_bar, write_json
+from dm_tools.output import JsonOption, console, output_file, progress_bar, write_json
 
 
 def show(lines: list[dict[str, Any]], figures: dict[str, Any]) -> None:
@@ -66,7 +66,8 @@ def bench(
         bool, typer.Option(help="Install prysm, hcipy and zernike apart from the suite, to compare with.")
     ] = True,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw the growth with size to this PNG file.", metavar="FILE")
+        Path | None,
+        typer.Option(help="Draw the growth with size to this PNG file.", metavar="FILE", callback=output_file),
     ] = None,
     json: JsonOption = None,
 ) -> None:

@@ -145,6 +145,7 @@ class FilmedScene:
 
     def _judge(self, request: FocusRequest) -> FocusState:
         state = FocusState(curvature=request.curvature, signals=[request.curvature] * 3)
+        state.conic_constant = request.conic_constant
         state.applied = abs(request.curvature) <= self.refuse_beyond
         state.history_known = self.history_known
         state.predicted_max_zernike_upper = 500e-9  # after a night, most of it creep of hours
@@ -447,11 +448,12 @@ def test_a_scene_without_texture_ends_without_a_focus(scene: FilmedScene, observ
     scene.texture[:] = 100.0
     unasked = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert "; the mirror stays where it is" in unasked.message, "nobody knows where it was"
-    scene.request.publish(FocusRequest(curvature=0.004))
+    scene.request.publish(FocusRequest(curvature=0.004, conic_constant=-1.0, zernike=[1e-8] * 21))
     wait_until(lambda: scene.states[-1].curvature == 0.004, what="the focus that was there before")
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert found.error_code == ErrorCode.NOT_CONVERGED and "; the mirror is back where it was" in found.message
-    assert scene.requests[-1].curvature == 0.004, "back where it was"
+    back = scene.requests[-1]
+    assert (back.curvature, back.conic_constant, list(back.zernike)) == (0.004, -1.0, [1e-8] * 21)
 
 
 def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedScene, observer: Observer) -> None:

@@ -43,15 +43,15 @@ class PlayedCamera:
     def wait(self, _condition: Any, _timeout_s: float) -> bool:
         return True
 
-    def boresight(self, _region: Any, image_topic: str, take_over: bool) -> Boresight:
-        assert image_topic == "image_raw" and not take_over
+    def boresight(self, _region: Any, image_topic: str, stamp_lead: float, take_over: bool) -> Boresight:
+        assert (image_topic, stamp_lead, take_over) == ("image_raw", 0.03, False)
         off = AXIS - self._held["optical_axis"] * (1 if self.still else -2)
         return Boresight(SCALE, SCALE @ off * RADIUS, np.full(2, 0.1))
 
 
 @pytest.fixture
 def held(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    values: dict[str, Any] = {"optical_axis": np.zeros(2)}
+    values: dict[str, Any] = {"optical_axis": np.zeros(2), "stamp_lead": 0.03}
     monkeypatch.setattr(dm_autofocus, "CameraFocusClient", lambda namespace: PlayedCamera(namespace, values))
     monkeypatch.setattr(dm_tools.boresight, "get_parameter", lambda _client, _node, name: values[name])
 
@@ -84,10 +84,10 @@ def test_an_axis_that_was_not_seen_to_be_right_is_not_kept(
 ) -> None:
     see = PlayedCamera.boresight
 
-    def interrupted(camera: PlayedCamera, region: Any, image_topic: str, take_over: bool) -> Boresight:
+    def interrupted(camera: PlayedCamera, region: Any, **how: Any) -> Boresight:
         if np.any(held["optical_axis"]):
             raise KeyboardInterrupt
-        return see(camera, region, image_topic, take_over)
+        return see(camera, region, **how)
 
     monkeypatch.setattr(PlayedCamera, "boresight", interrupted)
     with pytest.raises(KeyboardInterrupt):

@@ -103,6 +103,16 @@ def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:
         source_of(tmp_path / "new.yaml", source, "T-7")
 
 
+def test_of_a_file_for_two_mirrors_the_namespace_says_which(tmp_path: Path) -> None:
+    file = tmp_path / "both.yaml"
+    file.write_text("".join(f"/{side}/pdm_driver: {{ros__parameters: {{mirror.serial: {side}}}}}\n" for side in "AB"))
+    with pytest.raises(ConfigError, match=r"/B/pdm_driver: a second section of pdm_driver; .* chosen by --namespace"):
+        source_of(file, None, "B")
+    write_parameters(FOUND, file, source_of(file, None, "B", "/B"), "/B")
+    assert load_config(file, "B")["interferometer"]["orientation.flip_x"] is True
+    assert "interferometer" not in load_config(file, "A")
+
+
 @pytest.mark.parametrize(
     ("model", "law", "promised"),
     [

@@ -146,6 +146,24 @@ def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[st
     assert parsed("status", "--json", "/dev/stdout")["json"] == output.STANDARD_OUTPUT
 
 
+def test_where_no_file_can_be_written_nothing_begins(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "below" / "f"):
+        for words in (["status", "--json"], ["calibrate", "--write"], ["instrument", "flats", "t.csv", "--write"]):
+            refused = CliRunner().invoke(cli.app, [*words, str(path)])
+            assert refused.exit_code == 2 and f"{words[-1]}': {path}: must be a file" in refused.output.replace(
+                "\n", ""
+            )
+    assert parsed("status", "--json", str(tmp_path / "new" / "f"))["json"] == tmp_path / "new" / "f", "it is made"
+
+
+def test_a_name_in_square_brackets_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    said = r"[p01] of /maps[/tmp]\[night]:warning:"
+    output.console.print(f"[yellow]dropped[/] {said}")
+    output.next_step(said)
+    assert capsys.readouterr().out == f"dropped {said}\nnext: {said}\n"
+
+
 def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)

@@ -133,6 +133,7 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("pdm_driver", {"electronics.kind": "usb_dac40"}, "electronics.serial_port is empty"),
     ("pdm_driver", {"volts.dac_at_full": 0.0}, "volts.dac_at_full"),
     ("pdm_driver", {"volts.amplifier_gain": 0.0}, "volts.amplifier_gain = 0"),
+    ("pdm_driver", {"electronics.kind": "microscope"}, "must be 0, 1, 1 with electronics.kind = 'microscope'"),
     ("pdm_driver", {"volts.max": 0.0}, "must be above volts.min"),
     ("pdm_driver", {"volts.max": 900.0}, "volts.max"),
     ("pdm_driver", {"volts.min": -10.0, "drive.law": "square"}, "must be at least 0 with drive.law"),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import typer
 from dm_msgs.action import BuildRecipes
+from typer.testing import CliRunner
 
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import terms_of
+from dm_tools import cli
 from dm_tools.long_actions import recipe_step
 from dm_tools.verbs.recipes import curvatures_of
 
@@ -44,3 +46,9 @@ def test_added_terms_go_by_the_names_that_measure_prints() -> None:
 def test_terms_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=f"zernike = {text!r}"):
         terms_of(text)
+
+
+@pytest.mark.parametrize("words", [("--curvatures", "0.02"), ("--zernike", "coma sin=5"), ("--take-over",)])
+def test_a_list_builds_nothing(words: tuple[str, ...]) -> None:
+    refused = CliRunner().invoke(cli.app, ["recipes", "--list", *words])
+    assert refused.exit_code == 2 and f"--list and {words[0]}: only one of them" in refused.output

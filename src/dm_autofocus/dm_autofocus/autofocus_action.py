@@ -63,10 +63,10 @@ class AutofocusAction(ProbeAction):
             The peak; the search with the range that was possible, which depends on the actuators' history too;
             remarks for the result's message.
         """
-        before = self._probe.curvature
+        before = self._probe.shape
         sample: SharpnessSample | None = None
         approach = self._values["search.approach"]
-        search = FocusSearch(replace(config, approach=0.0), self._model(config, region), before)
+        search = FocusSearch(replace(config, approach=0.0), self._model(config, region), before[0])
         while not search.current.done:
             step = search.current.step
             try:
@@ -92,8 +92,8 @@ class AutofocusAction(ProbeAction):
             self._log.info(f"the range was swept: {search.reason}")
         if search.current.peak is None:
             left = "the mirror stays where it is"
-            if math.isfinite(before):
-                self._probe.move(before)
+            if math.isfinite(before[0]):
+                self._probe.move(*before)
                 left = "the mirror is back where it was"
             fault = exposure_fault(sample.regions[0]) if sample else ""
             raise Refusal(

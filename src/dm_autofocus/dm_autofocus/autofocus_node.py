@@ -116,7 +116,7 @@ class AutofocusNode(ManagedNode):
     # --- state ---
 
     def _publish(self, phase: Phase, sample: SharpnessSample) -> None:
-        curvature = self._probe.curvature
+        curvature = self._probe.shape[0]
         state = AutofocusState(phase=int(phase), sharpness=sample.sharpness, curvature=curvature, power=2 * curvature)
         state.header = sample.image.header
         state.dioptre = self._optics.dioptre_for(curvature) if math.isfinite(curvature) else math.nan

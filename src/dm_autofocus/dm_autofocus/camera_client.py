@@ -141,7 +141,13 @@ class CameraFocusClient(DeformableMirrorClient):
         return result, image, depth[..., 0]
 
     def boresight(
-        self, region: Sequence[float], *, pairs: int = 6, image_topic: str = "image_raw", **claim: Unpack[Claim]
+        self,
+        region: Sequence[float],
+        *,
+        pairs: int = 6,
+        image_topic: str = "image_raw",
+        stamp_lead: float = 0.0,
+        **claim: Unpack[Claim],
     ) -> Boresight:
         """Measure how the picture moves with the mirror's tilt and with the focus; ends at the focus of the region.
 
@@ -149,6 +155,7 @@ class CameraFocusClient(DeformableMirrorClient):
             region: left, top, width, height as shares 0..1 of the image: an object that stands still.
             pairs: images on either side of the focus, in turns.
             image_topic: of the camera, as `autofocus` takes it; with /compressed behind it too.
+            stamp_lead: by how much an exposure begins before its image's stamp [s], as `autofocus` has it.
             claim: where somebody holds the mirror.
 
         Raises:
@@ -167,7 +174,7 @@ class CameraFocusClient(DeformableMirrorClient):
             zernike = np.zeros(len(TERMS))
             zernike[1:PISTON_TILT] = tilt
             state = self.focus(curvature, zernike=zernike.tolist(), **claim)
-            begin = seconds_of(state.header.stamp) + state.predicted_duration + SETTLE_S
+            begin = seconds_of(state.header.stamp) + state.predicted_duration + SETTLE_S + stamp_lead
 
             def fresh() -> list[Any]:
                 came = [self.messages[topic] for topic in topics if topic in self.messages]

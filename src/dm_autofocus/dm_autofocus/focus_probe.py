@@ -7,9 +7,10 @@ import threading
 import time
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ class FocusProbe:
     Attributes:
         controller: whether it is there.
         capabilities: its latest; None before the first.
-        curvature: as taken last, whoever asked for it [1/m]; NaN before.
+        shape: as taken last: curvature [1/m], NaN before; conic constant; terms [m] if `focus_request` asked for it.
         user: action that holds the mirror; "" = none does.
         target: as asked for by `move` last [1/m]; NaN while nobody holds the mirror.
         topic: of the images.
@@ -77,7 +78,8 @@ class FocusProbe:
         self._gate = SettledGate(values["settle_time"], values["stamp_lead"])
         self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
-        self.curvature = math.nan
+        self.shape: tuple[float, float, Sequence[float]] = (math.nan, 0.0, ())
+        self._asked_for = FocusRequest()  # on that topic, last
         self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
@@ -95,10 +97,11 @@ class FocusProbe:
         self._hold = MirrorHolder(node, node.get_name())
         self._node, self.topic = node, ""
         self._images: Any = None
-        node.create_subscription(CameraInfo, "camera_info", self._on_camera_info, IMAGES)
+        node.create_subscription(CameraInfo, "camera_info", partial(setattr, self, "camera_info"), IMAGES)
+        node.create_subscription(FocusRequest, "focus_request", partial(setattr, self, "_asked_for"), qos.COMMAND)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
-        node.create_subscription(Capabilities, "capabilities", self._on_capabilities, qos.LATCHED)
+        node.create_subscription(Capabilities, "capabilities", partial(setattr, self, "capabilities"), qos.LATCHED)
 
     def subscribe(self) -> None:
         """Take images as `image_transport` says now."""
@@ -115,12 +118,6 @@ class FocusProbe:
 
     # --- messages ---
 
-    def _on_capabilities(self, message: Capabilities) -> None:
-        self.capabilities = message
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        self.camera_info = message
-
     def _on_image(self, message: Image | CompressedImage) -> None:
         with self._changed:
             before, self.newest = self.newest, message
@@ -135,7 +132,10 @@ class FocusProbe:
     def _on_focus_state(self, message: FocusState) -> None:
         with self._changed:
             if message.applied:
-                self.curvature = message.curvature
+                shape, asked = (message.curvature, message.conic_constant), self._asked_for
+                answered = (asked.curvature, asked.conic_constant) == shape
+                self.shape = (*shape, asked.zernike if answered else ())
+                self._asked_for = FocusRequest() if answered else asked
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
@@ -204,8 +204,8 @@ class FocusProbe:
             self._other_request = None
             self.user = ""
 
-    def move(self, curvature: float) -> None:
-        """Ask for a curvature [1/m] and wait until its shape stands.
+    def move(self, curvature: float, conic_constant: float = 0.0, zernike: Sequence[float] = ()) -> None:
+        """Ask for a curvature [1/m], with terms added [m], and wait until its shape stands.
 
         Raises:
             Refusal: refused, no answer, another node moves the mirror, the move does not end, or the user is to stop.
@@ -217,7 +217,8 @@ class FocusProbe:
             self.target = curvature
             self._asked.append(curvature)
         mode, holder, gone = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
-        self._request.publish(FocusRequest(curvature=curvature, mode=mode, holder=holder))
+        shape = {"curvature": curvature, "conic_constant": conic_constant, "zernike": zernike}
+        self._request.publish(FocusRequest(**shape, mode=mode, holder=holder))
         limit = self._values["move_timeout"]
         self._wait(lambda: self.answer is not None or bool(gone()), limit, self._check)
         answer = self.answer
@@ -242,8 +243,7 @@ class FocusProbe:
         samples: list[SharpnessSample] = []
         limit = self._values["image_timeout"]
         with self._changed:
-            self._fresh = None
-            self._measuring = True
+            self._fresh, self._measuring = None, True
         try:
             while len(samples) < self._values["images_per_step"]:
                 self._wait(lambda: self._fresh is not None, limit, self._check)

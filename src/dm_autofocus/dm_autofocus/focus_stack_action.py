@@ -51,10 +51,10 @@ class FocusStackAction(ProbeAction):
         return np.linspace(low, high, goal.images or min(max(NOISE_POINTS, 1 + math.ceil((high - low) / step)), MOST))
 
     def _carry_out(self, goal_handle: WorkerGoal, plan: NDArray[np.float64], result: Any) -> None:
-        before = self._probe.curvature
+        before = self._probe.shape
         stack, image = self._sweep(goal_handle, plan)
-        if math.isfinite(before):
-            self._probe.move(before)
+        if math.isfinite(before[0]):
+            self._probe.move(*before)
         try:
             places = stack.in_focus(self._values["search.least_contrast"])
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""How long the client stays on the focus. Without processes, in simulated time."""
+"""What the client makes of time: how long it stays on the focus, which images count. Without processes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
-from dm_msgs.msg import AutofocusState
+from dm_msgs.msg import AutofocusState, FocusState
+from sensor_msgs.msg import Image
 
 from dm_autofocus import CameraFocusClient, camera_client
 from dm_client import DeformableMirrorError
 from dm_common.errors import ErrorCode
+from dm_common.messages import time_message
 
 
 @pytest.mark.parametrize("lost_after", [None, 3.0])
@@ -43,3 +46,33 @@ def test_it_tracks_from_the_end_of_the_search_on(lost_after: float | None, monke
     else:
         with pytest.raises(DeformableMirrorError, match="no more"):
             client.track(5.0, on_feedback=heard.append)
+
+
+@pytest.mark.parametrize(("stamp", "counts"), [(10.3, False), (10.4, True)])
+def test_the_axis_is_found_by_images_exposed_after_the_move(
+    stamp: float, counts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A move of 0.1 s from 10 s on, 0.05 s to settle, and stamps that come 0.2 s after the exposure began."""
+    client = CameraFocusClient.__new__(CameraFocusClient)
+    image, state = (
+        Image(height=8, width=8, step=8, encoding="mono8", data=bytes(64)),
+        FocusState(predicted_duration=0.1),
+    )
+    image.header.stamp, state.header.stamp = time_message(round(stamp * 1e9)), time_message(10 * 10**9)
+    reach = SimpleNamespace(curvature_min=-0.05, curvature_max=0.05, curvature_tolerance=1e-4)
+    played = {
+        "autofocus": lambda *_region: SimpleNamespace(curvature=0.0),
+        "focus_range": lambda: reach,
+        "hear": lambda *_topic: True,
+        "focus": lambda *_curvature, **_shape: state,
+        "wait": lambda condition: condition(),
+        "messages": {"image_raw": image},
+    }
+    for name, value in played.items():
+        monkeypatch.setattr(client, name, value, raising=False)
+    monkeypatch.setattr(camera_client, "find_boresight", lambda see, *_plan: see(0.0, np.zeros(2)).size)
+    if counts:
+        assert client.boresight([0, 0, 1, 1], stamp_lead=0.2) == 64
+    else:
+        with pytest.raises(DeformableMirrorError, match="no image on image_raw"):
+            client.boresight([0, 0, 1, 1], stamp_lead=0.2)

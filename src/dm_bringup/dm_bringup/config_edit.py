@@ -1,6 +1,6 @@
 """Change values in a parameter file and leave all else as it is: comments, order, spelling."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import yaml
@@ -10,31 +10,42 @@ from dm_bringup.suite import ConfigError, flat
 Changes = Mapping[str, Mapping[str, Any]]
 
 
-def edited(text: str, changes: Changes) -> str:
+def edited(text: str, changes: Changes, namespace: str = "") -> str:
     """The parameter file `text` with the values of `changes`, {node: {parameter: value}}.
 
     A value stands where it stood; new parameters come first in their section, a new section last in the file, both in
-    the order of `changes`.
+    the order of `changes`. In a file with sections of several mirrors they are those of the mirror in `namespace`.
 
     Raises:
         ConfigError: the text has a form that cannot be changed so; nothing is lost by an edit.
     """
-    expected = values_of(text)
+    expected = _sections(text)
     for node, values in changes.items():
-        expected[node] = expected.get(node, {}) | dict(values)
+        key = _key(expected, node, namespace.strip("/"))
+        expected[key] = expected.get(key, {}) | dict(values)
         for name, value in reversed(list(values.items())):  # each new one goes before those that are there
-            text = _with_value(text, node, name, value)
-    if values_of(text) != expected:
+            text = _with_value(text, key, name, value)
+    if _sections(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
     return text
 
 
-def _with_value(text: str, node: str, name: str, value: Any) -> str:
-    section, literal = _section(text, node), _literal(value)
+def _key(keys: Collection[str], node: str, namespace: str) -> str:
+    """The section for what concerns one mirror: its own, also a new one where it has some, before that of all."""
+    places = {key: key.rpartition("/")[0].strip("/") for key in keys}
+    of_node = [key for key in keys if _node_name(key) == node]
+    own = [key for key in of_node if "*" not in key and (not namespace or places[key] in ("", namespace))]
+    if not own and namespace and namespace in places.values():
+        return f"/{namespace}/{node}"
+    return (own or of_node or [f"/**/{node}"])[0]
+
+
+def _with_value(text: str, key: str, name: str, value: Any) -> str:
+    section, literal = _section(text, key), _literal(value)
     if section is None:
-        return f"{text.rstrip()}\n\n/**/{node}:\n  ros__parameters:\n    {name}: {literal}\n"
-    for key, old in section.value:
-        if key.value == name:
+        return f"{text.rstrip()}\n\n{key}:\n  ros__parameters:\n    {name}: {literal}\n"
+    for parameter, old in section.value:
+        if parameter.value == name:
             start, end = old.start_mark, old.end_mark.index
             if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # an item on each line: so it stays
                 end = old.value[-1].end_mark.index
@@ -47,26 +58,30 @@ def _with_value(text: str, node: str, name: str, value: Any) -> str:
     return f"{text[: first.index]}{name}: {literal}\n{' ' * first.column}{text[first.index :]}"
 
 
-def _section(text: str, node: str) -> Any:
-    """The YAML node of the parameters of `node`; None where it has none."""
+def _section(text: str, key: str) -> Any:
+    """The YAML node of the parameters of the section `key`; None where there is none."""
     top = yaml.compose(text, yaml.SafeLoader)
-    for key, content in top.value if top is not None else ():
-        if _node_name(key.value) == node:
+    for title, content in top.value if top is not None else ():
+        if title.value == key:
             return next(section for inner, section in content.value if inner.value == "ros__parameters")
     return None
 
 
 def values_of(text: str) -> dict[str, dict[str, Any]]:
     """The values of a parameter file by nodes. Raises ConfigError."""
+    return {_node_name(key): values for key, values in _sections(text).items()}
+
+
+def _sections(text: str) -> dict[str, dict[str, Any]]:
     try:
         content = yaml.safe_load(text) or {}
-        return {_node_name(key): flat(section["ros__parameters"]) for key, section in content.items()}
+        return {str(key): flat(section["ros__parameters"]) for key, section in content.items()}
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"not a parameter file: {type(error).__name__}: {error}") from error
 
 
-def _node_name(key: Any) -> str:
-    return str(key).rsplit("/", 1)[-1]
+def _node_name(key: str) -> str:
+    return key.rsplit("/", 1)[-1]
 
 
 def _literal(value: Any) -> str:

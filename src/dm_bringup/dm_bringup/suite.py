@@ -60,7 +60,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
             result[name] = values | result.get(name, {})
             continue
         if name in own:
-            raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or told by the namespace")
+            raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or chosen by --namespace")
         own.add(name)
         result[name] = result.get(name, {}) | values
     return result

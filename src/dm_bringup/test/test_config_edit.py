@@ -65,6 +65,18 @@ def test_files_of_other_forms(text: str) -> None:
     assert all(comment in edited(text, CHANGES) for comment in ("# as wired", "# that is all") if comment in text)
 
 
+def test_of_two_mirrors_in_a_file_one_changes() -> None:
+    text = "/**/pdm_driver: {ros__parameters: {a: 1}}\n" + "".join(
+        f"/{side}/pdm_driver: {{ros__parameters: {{mirror.wiring: trihex}}}}\n" for side in ("left", "right")
+    )
+    before, after = (yaml.safe_load(each) for each in (text, edited(text, CHANGES, "/right")))
+    for node, values in CHANGES.items():
+        before.setdefault(f"/right/{node}", {}).setdefault("ros__parameters", {}).update(values)
+    assert after == before
+    assert "/**/interferometer:" in edited(text, CHANGES, "third"), "it has no section of its own"
+    assert yaml.safe_load(edited(text, CHANGES, "third"))["/**/pdm_driver"]["ros__parameters"]["a"] == 1
+
+
 def test_what_is_no_parameter_file_is_refused() -> None:
     for text in ("a: [", "- 1\n- 2\n", "/**/pdm_driver: 7\n"):
         with pytest.raises(ConfigError):

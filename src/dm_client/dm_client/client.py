@@ -174,8 +174,9 @@ class DeformableMirrorClient(Connection):
         return self.run_action("degauss", filled(Degauss.Goal, steps=steps, **claim), on_feedback, timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
-        """Take one map with the interferometer."""
-        return self.call("measure", filled(Measure.Request, label=label), timeout_s)
+        """Take one map with the interferometer, which gives up after `timeout_s` and says why."""
+        request = filled(Measure.Request, label=label, timeout=timeout_s)
+        return self.call("measure", request, timeout_s + 5.0)
 
     def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:
         """Read one map file."""

@@ -49,6 +49,14 @@ def test_what_is_no_such_thing_is_refused_by_name(kind: Any, fields: dict[str, A
     assert refused.value.error_code == code
 
 
+def test_the_interferometer_keeps_the_time_of_a_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(DeformableMirrorClient, "call", lambda _self, *arguments: asked.append(arguments))
+    DeformableMirrorClient.__new__(DeformableMirrorClient).measure("night", timeout_s=7)
+    ((name, request, waits),) = asked
+    assert (name, request.timeout) == ("measure", 7.0) and waits > 7.0, "its answer says why"
+
+
 @pytest.mark.parametrize("namespace", ["1bad", "my mirror", "a//b"])
 def test_a_namespace_that_cannot_be_is_refused(namespace: str) -> None:
     with pytest.raises(DeformableMirrorError, match="namespace = ") as refused:

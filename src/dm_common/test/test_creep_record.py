@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,6 +210,21 @@ def test_a_disk_that_fails_leaves_the_record_that_was_there(tmp_path: Path, monk
     kept = read_record(file, 30.0)
     assert kept is not None and kept.time == 10.0
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_folder_that_cannot_be_synced_has_the_new_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on many file systems in a network."""
+    file, sync = tmp_path / "mirror.creep.npz", os.fsync
+
+    def of_files_only(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files_only)
+    write_record(file, AT_REST)
+    kept = read_record(file, 30.0)
+    assert kept is not None and kept.time == AT_REST.time
 
 
 def test_a_record_of_another_law_or_mirror_is_not_used() -> None:

@@ -34,7 +34,7 @@ LOOP_PARAMETERS = (
     Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
     Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
     live("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed"),
-    Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
+    Parameter("recipes.degauss_steps", whole(100, 5, 10000), "half-swings of the degauss that recipes begin with"),
     Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
 

@@ -3,6 +3,7 @@
 The latest command wins. A move is cut into steps by the safety limiter and written by `dm_driver.writer_thread`.
 """
 
+import logging
 import time
 
 from dm_common.errors import ErrorCode, Refusal
@@ -58,9 +59,11 @@ class ActuatorWriter(WriterThread):
                 return self._shape
         recorded = self._last.load()
         try:
-            return None if recorded is None else self._limiter.check_shape(recorded)
-        except Refusal:  # the limits have changed: no legal way begins there
-            return None
+            if recorded is not None:
+                return self._limiter.check_shape(self._output.scale.signals_of_codes(recorded), "what was sent last")
+        except Refusal as refusal:  # the limits have changed: no legal way begins there
+            logging.getLogger(__name__).warning("the first shape is written in one step: %s", refusal)
+        return None
 
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.

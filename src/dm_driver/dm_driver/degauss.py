@@ -12,6 +12,9 @@ from dm_driver.safety_limiter import DriverLimits, Shape
 
 #: A degauss of at least this share of the full range leaves nothing of what was before.
 FULL_CYCLE = 0.999
+#: n half-swings leave up to 1 / (2 n) of the first in the hysteresis; where that is more than a tenth, the history that
+#: follows is not the one of a mirror at rest that everybody goes by.
+STEPS_MIN = 5
 #: Most half-swings: smaller ones than these leave would be below a step of the electronics.
 STEPS_MAX = 10000
 
@@ -73,4 +76,5 @@ def degauss_move(
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
     # A smaller cycle leaves what wider swings have written.
-    return Move(Kind.DEGAUSS, end, waypoints, wipes=swing >= FULL_CYCLE * largest, steps=steps, duration=duration)
+    wipes = swing >= FULL_CYCLE * largest and steps >= STEPS_MIN
+    return Move(Kind.DEGAUSS, end, waypoints, wipes, steps, duration)

@@ -63,6 +63,12 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         frame=from_values(FrameFormat, values if kind == "framed_serial" else {}, "framed_serial."),
     )
     back_end = make_electronics(kind, settings)  # finds a missing setting now
+    unit = tuple(values[f"volts.{name}"] for name in ("dac_at_zero", "dac_at_full", "amplifier_gain"))
+    if not back_end.knows_volts and unit != (0.0, 1.0, 1.0):
+        raise ValueError(
+            "volts.dac_at_zero, volts.dac_at_full, volts.amplifier_gain = {:g}, {:g}, {:g}: must be 0, 1, 1 with"
+            " electronics.kind = {!r}, which takes numbers from 0 to 1 and not volts".format(*unit, kind)
+        )
     channel_of_actuator = wiring_table(values["mirror.wiring"], values["mirror.channels"], actuators, back_end.channels)
     scale = VoltScale(
         max_code=back_end.max_code,

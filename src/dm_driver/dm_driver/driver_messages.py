@@ -56,8 +56,9 @@ def state_message(
     message.moving = state.moving is not None
     message.history_known = state.history_known
     message.degausses, message.turns = state.degausses, state.turns
-    if state.enabled and not state.link_up:
-        message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, state.fault
+    if not state.link_up:
+        waits = "" if state.enabled else "the driver is not active, and the drive electronics are unreachable: "
+        message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, f"{waits}{state.fault}"
     connected = configuration.output.connected
     flags = np.where(connected, 0, ActuatorState.FLAG_UNUSED).astype(np.uint8)
     if refusal is not None and refusal.actuators is not None:

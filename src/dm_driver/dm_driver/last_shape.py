@@ -2,7 +2,8 @@
 
 No unit can be read back, and its outputs hold when the driver dies. A new driver that knows nothing must write its
 first shape in one step; one that finds this record goes on from where the old one ended. A shape is recorded *before*
-it is sent: what stands at the outputs is then the record or at most one step away from it.
+it is sent: what stands at the outputs is then the record or at most one step away from it. Its numbers are the codes
+that it becomes, not rounded: they stand for the same outputs when the volts of the signals are configured anew.
 
 Two slots are written in turn, each with a check sum, so that one is whole at any moment. The operating system keeps
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
@@ -20,7 +21,7 @@ from dm_driver.safety_limiter import Shape
 
 _HEAD = struct.Struct("<8sQI")  # magic, number of the write, actuators
 _CHECK = struct.Struct("<I")
-_MAGIC = b"dmshape1"
+_MAGIC = b"dmshape2"
 
 
 class LastShape:
@@ -44,7 +45,7 @@ class LastShape:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
 
     def load(self) -> Shape | None:
-        """(N,) the newest whole record; None when there is none for this number of actuators."""
+        """(N,) codes, the newest whole record; None when there is none for this number of actuators."""
         if self._descriptor < 0:
             return None
         newest = None
@@ -54,8 +55,8 @@ class LastShape:
                 self._number, newest = number, shape
         return newest
 
-    def note(self, shape: Shape) -> None:
-        """Record `shape` (N,) as what is about to be sent.
+    def note(self, codes: Shape) -> None:
+        """Record `codes` (N,) as what is about to be sent.
 
         Raises:
             OSError: the disk is full, or gone.
@@ -63,7 +64,7 @@ class LastShape:
         if self._descriptor < 0:
             return
         self._number += 1
-        content = _HEAD.pack(_MAGIC, self._number, self._actuators) + shape.astype("<f8").tobytes()
+        content = _HEAD.pack(_MAGIC, self._number, self._actuators) + codes.astype("<f8").tobytes()
         os.pwrite(self._descriptor, content + _CHECK.pack(zlib.crc32(content)), self._slot * (self._number % 2))
 
     def close(self) -> None:

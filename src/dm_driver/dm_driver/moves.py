@@ -36,7 +36,7 @@ class Move:
         kind: what it is for.
         target: (N,) where it ends.
         waypoints: shapes to pass, the target last; straight lines between them. None = straight to the target.
-        wipes: a degauss over the full range, which wipes the hysteresis.
+        wipes: a degauss over the full range by enough half-swings, which wipes the hysteresis.
         steps, duration: of a degauss: its half-swings, and how long they take, s.
         begun: waypoints that the mirror is past, or on its way to.
         before: (N,) where the last accepted move led when this one was put in its place; where that was a degauss, what

@@ -251,7 +251,7 @@ class WriterThread:
 
     def _record(self, shape: Shape) -> None:
         try:
-            self._last.note(shape)
+            self._last.note(self._output.scale.exact_codes(shape))
             self._recording = True
         except OSError as error:  # a full disk must not stop the mirror
             if self._recording:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,8 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
 
 def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=1e4) as (writer, _told):
+        assert degauss(writer, 0.0, 4, shape(0.2)).wait(10) is Outcome.REACHED
+        assert not writer.state().history_known, "an eighth of the first half-swing may be left"
         assert degauss(writer, 0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
         assert writer.state().history_known and writer.state().degausses == 1
         assert writer.command(shape(0.25)).wait(5) is Outcome.REACHED
@@ -384,7 +387,7 @@ def ramp_to_safe_shape(unit: Edac40TcpUnit, begins_at: float, since: int = 0) ->
 
 def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpUnit, tmp_path: Path) -> None:
     last = LastShape(tmp_path / "unit.shape", 37)
-    last.note(shape(0.8))  # by a driver that was killed
+    last.note(replace(SCALE, volts_max=400.0).exact_codes(shape(0.35)))  # 270 V, by a driver that was killed
     unit.unplug()
     with started_writer(unit, electronics=Counting, last=last) as (writer, _told):
         assert not writer.enable(0.0)
@@ -407,7 +410,7 @@ def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpU
 def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path: Path, commanded: bool) -> None:
     """The way goes on, unless an accepted command took its place: then the shape stays where the link was lost."""
     last = LastShape(tmp_path / "unit.shape", 37)
-    last.note(shape(0.8))
+    last.note(SCALE.exact_codes(shape(0.8)))
     with started_writer(unit, slew_rate=1.0, last=last) as (writer, _told):
         assert writer.wait_for_link(5)
         writer.enable(0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from dm_msgs.msg import ActuatorState
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dm_common.errors import ErrorCode
 from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_messages import state_message
 from dm_driver.moves import Kind, WriterState
@@ -70,6 +72,10 @@ def test_custom_wiring_with_an_unconnected_actuator() -> None:
     state = state_message(moving, None, configuration, "mirror", MirrorHold(lambda: 0.0))
     on_its_way = ActuatorState.FLAG_RAMPING | ActuatorState.FLAG_AT_LIMIT
     assert list(state.flags) == [on_its_way, ActuatorState.FLAG_UNUSED, 0]
+    lost = replace(moving, link_up=False, enabled=False, fault="no route")
+    told = state_message(lost, None, configuration, "mirror", MirrorHold(lambda: 0.0))
+    assert told.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+    assert told.message == "the driver is not active, and the drive electronics are unreachable: no route"
 
 
 def test_vendor_rule_when_the_range_is_the_whole_dac() -> None:

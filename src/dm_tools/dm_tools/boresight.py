@@ -62,16 +62,17 @@ def run_boresight(
     with CameraFocusClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), BUSY_S):
             raise NotRunningError("no node of the suite is heard: start them (./dm up --camera, or your launch file)")
-        source = source_of(write, config, client.mirror_info.serial) if write is not None else None
+        source = source_of(write, config, client.mirror_info.serial, namespace) if write is not None else None
         reach = client.focus_range()
         span = reach.curvature_max - reach.curvature_min
 
         def moved() -> tuple[Any, float, float]:
             """What was found, by how much the picture moves over the range, and its standard deviation, px."""
             with console.status("tip, tilt and focus, to and fro"):
-                found = client.boresight(part, image_topic=image_topic, take_over=take_over)
+                found = client.boresight(part, image_topic=image_topic, stamp_lead=lead, take_over=take_over)
             return found, float(span * np.hypot(*found.drift)), float(span * np.hypot(*found.drift_sigma))
 
+        lead = get_parameter(client, "autofocus", "stamp_lead")
         axis = np.array(get_parameter(client, "focus_controller", "optical_axis"))
         found, before, sigma = moved()
         console.print(f"over the range the picture moves by {before:.2f} px (± {sigma:.2f})")
@@ -102,7 +103,7 @@ def run_boresight(
     write_json(json, {"boresight": figures | cost})
     parameters = parameter_text({"focus_controller": {"optical_axis": axis.round(6).tolist()}})
     if write is not None and source is not None:
-        write_parameters(parameters, write, source)
+        write_parameters(parameters, write, source, namespace)
     else:
         console.print("in use until the node ends; for its next start (--write FILE does it) put into its file:")
         console.print(parameters, markup=False, highlight=False)

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,12 +11,27 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from dm_common.figures import in_wavelengths
 
+#: Square brackets that are no markup of these commands, and the backslashes before them.
+_NO_MARKUP = re.compile(r"(\\*)(\[(?!(?:/|bold|dim|(?:bold )?(?:red|green|yellow))\])[a-z#/@][^[]*?\])")
+
+
+class _Screen(Console):
+    """Prints names in square brackets as they are."""
+
+    def render_str(self, text: str, *, markup: bool | None = None, **how: Any) -> Text:
+        escaped = text if markup is False else _NO_MARKUP.sub(r"\1\1\\\2", text)
+        return super().render_str(escaped, markup=markup, **how)
+
+
 #: A pipe or a file gets whole lines.
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 120, soft_wrap=not sys.stdout.isatty())
-errors = Console(stderr=True, highlight=False)
+console = _Screen(
+    highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120, soft_wrap=not sys.stdout.isatty()
+)
+errors = Console(stderr=True, highlight=False, emoji=False)
 
 #: `--json -`.
 STANDARD_OUTPUT = Path("-")
@@ -22,9 +39,19 @@ STANDARD_OUTPUT = Path("-")
 WAVELENGTH = 632.8e-9
 
 
+def output_file(path: Path | None) -> Path | None:
+    """`path`, where a file can be written, which a long run must not end with. Raises typer.BadParameter."""
+    if path is None or path == STANDARD_OUTPUT or path.is_relative_to("/dev"):
+        return path
+    nearest = next(folder for folder in path.absolute().parents if folder.exists())  # those below it are made
+    if path.is_dir() or not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise typer.BadParameter(f"{path}: must be a file, in a folder in which one can be written")
+    return path
+
+
 def _free_standard_output(path: Path | None) -> Path | None:
     """Where figures go to standard output, everything else is written on standard error."""
-    path = STANDARD_OUTPUT if path == Path("/dev/stdout") else path
+    path = output_file(STANDARD_OUTPUT if path == Path("/dev/stdout") else path)
     console.file = sys.stderr if path == STANDARD_OUTPUT else None  # type: ignore[assignment]
     return path
 
@@ -83,7 +110,7 @@ def progress_bar(steady: bool = True) -> Progress:
     Nothing is drawn where nobody watches: into a pipe or a file.
     """
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

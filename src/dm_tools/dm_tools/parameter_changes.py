@@ -43,12 +43,13 @@ def _answer(client: Any, node: str, ask: Any) -> Any:
     raise DeformableMirrorError(code, f"the node `{node}` does not answer: is it running (./dm up)?")
 
 
-def source_of(target: Path, config: Path | None, serial: str) -> Path:
+def source_of(target: Path, config: Path | None, serial: str, namespace: str = "") -> Path:
     """The parameter file from which :func:`write_parameters` makes `target`.
 
     Args:
         config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
         serial: of the running mirror.
+        namespace: of its nodes; "" = none.
 
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
@@ -57,14 +58,14 @@ def source_of(target: Path, config: Path | None, serial: str) -> Path:
     from dm_tools.verbs.up import shared_config
 
     source = config or (target if target.exists() else shared_config("bench.yaml"))
-    written = str(load_config(source).get("pdm_driver", {}).get("mirror.serial", ""))
+    written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
         raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
     return source
 
 
-def write_parameters(parameters: str, target: Path, source: Path) -> None:
-    """Write the parameter file `target`: `source` with the `parameters` that were found; comments are kept.
+def write_parameters(parameters: str, target: Path, source: Path, namespace: str = "") -> None:
+    """Write the parameter file `target`: `source` with the `parameters` found of a mirror; comments are kept.
 
     What stood at `target` is kept beside it, and nothing that was kept so before is lost.
 
@@ -78,7 +79,7 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
     if not parameters:
         console.print(f"no parameter has to be changed: {target} is not written")
         return
-    text = edited(source.read_text(), values_of(parameters))
+    text = edited(source.read_text(), values_of(parameters), namespace)
     keep_before(target)
     write_whole(target.resolve(), text.encode())
     console.print(f"{target} is written from {source}: start the nodes with it, then check again")

@@ -97,13 +97,18 @@ class VoltScale:
         """
         if not bool((np.abs(signals) <= 1.0).all()):  # also false for NaN
             raise ValueError(f"signals = {signals}: must be finite and in -1 to 1")
-        return np.clip(np.rint(self._exact_codes(signals)), *self._code_range).astype(np.uint16)
+        return np.clip(np.rint(self.exact_codes(signals)), *self._code_range).astype(np.uint16)
 
-    def signals_of_codes(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+    def exact_codes(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Codes of normalised signals, not rounded."""
+        dac_volts = self.volts(signals) / self.amplifier_gain
+        return np.asarray((dac_volts - self.dac_volts_at_zero) * (self.max_code / self._dac_span), dtype=np.float64)
+
+    def signals_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
         """Normalised signals that stand at the actuators for these codes."""
         return self.signals(self.volts_of_codes(codes))
 
-    def volts_of_codes(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+    def volts_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
         """Actuator volts for these codes."""
         dac_volts = self.dac_volts_at_zero + codes * (self._dac_span / self.max_code)
         return np.asarray(dac_volts * self.amplifier_gain, dtype=np.float64)
@@ -127,12 +132,8 @@ class VoltScale:
     def _dac_span(self) -> float:
         return self.dac_volts_at_full - self.dac_volts_at_zero
 
-    def _exact_codes(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
-        dac_volts = self.volts(signals) / self.amplifier_gain
-        return np.asarray((dac_volts - self.dac_volts_at_zero) * (self.max_code / self._dac_span), dtype=np.float64)
-
     @cached_property
     def _code_range(self) -> tuple[int, int]:
         """Smallest and largest code inside volts_min..volts_max."""
-        ends = np.sort(self._exact_codes(np.array([-1.0, 1.0])))
+        ends = np.sort(self.exact_codes(np.array([-1.0, 1.0])))
         return math.ceil(ends[0] - _CODE_SLACK), math.floor(ends[1] + _CODE_SLACK)

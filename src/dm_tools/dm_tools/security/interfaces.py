@@ -100,7 +100,10 @@ _DECLARED = (
             *("autofocus_state", "focus_request"),
             *("focus_stack/camera_info", "focus_stack/depth", "focus_stack/image"),
         ),
-        subscribe=("actuator_state", "capabilities", "focus_state", "camera_info", "image_raw", "image_raw/compressed"),
+        subscribe=(
+            *("actuator_state", "capabilities", "focus_request", "focus_state"),
+            *("camera_info", "image_raw", "image_raw/compressed"),
+        ),
         reply=("get_focus_range", "set_focus_distance"),
         request=("hold_mirror", "set_focus"),
         execute=("autofocus", "focus_stack"),

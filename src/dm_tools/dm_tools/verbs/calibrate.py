@@ -18,6 +18,7 @@ from dm_tools.output import (
     figures,
     nanometres,
     next_step,
+    output_file,
     progress_bar,
     write_json,
 )
@@ -190,7 +191,10 @@ def calibrate(
     ] = IMAGE_TOPIC,
     write: Annotated[
         Path | None,
-        typer.Option(help="Write what a poke check or --boresight finds into this copy of the parameter file."),
+        typer.Option(
+            help="Write what a poke check or --boresight finds into this copy of the parameter file.",
+            callback=output_file,
+        ),
     ] = None,
     config: Annotated[
         Path | None,
@@ -244,7 +248,9 @@ def calibrate(
     )
     fresh = fresh and not dry_run
     with running_suite(namespace) as client, naming_holder(client):
-        source = source_of(write, config, client.mirror_info.serial) if write is not None and not dry_run else None
+        source = None
+        if write is not None and not dry_run:
+            source = source_of(write, config, client.mirror_info.serial, namespace)
         if fresh:
             set_parameter(client, "calibration", "start_fresh", True)
         try:
@@ -256,7 +262,7 @@ def calibrate(
             if (response := getattr(error, "response", None)) is not None:
                 show_result(response)
                 if write is not None and source is not None and response.parameters:
-                    write_parameters(response.parameters, write, source)
+                    write_parameters(response.parameters, write, source, namespace)
             if fresh:  # refused or interrupted before it began, it would hold for somebody else's goal
                 with suppress(DeformableMirrorError):
                     set_parameter(client, "calibration", "start_fresh", False)
@@ -270,7 +276,7 @@ def calibrate(
         if until:
             console.print(next((part for part in result.message.split("; ") if REACHED.search(part)), ""))
     if write is not None and source is not None:
-        write_parameters(result.parameters, write, source)
+        write_parameters(result.parameters, write, source, namespace)
     write_json(json, {"calibration": figures_of(result)})
     if dry_run:
         next_step("the same without --dry-run measures")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, console, nanometres, next_step, write_json
+from dm_tools.output import JsonOption, console, nanometres, next_step, output_file, write_json
 from dm_tools.parameter_changes import keep_before
 
 #: Columns of tables that hold no numbers.
@@ -35,7 +35,9 @@ def instrument(
         ),
     ],
     files: Annotated[list[Path], typer.Argument(help="Tables (CSV with these headings), map files.")],
-    write: Annotated[Path | None, typer.Option(metavar="FILE.fits", help="Where the reference surface goes.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE.fits", help="Where the reference surface goes.", callback=output_file)
+    ] = None,
     xyz_unit: Annotated[str, typer.Option(help="Unit of .xyz files, and of FITS files without one.")] = "",
     json: JsonOption = None,
 ) -> None:

@@ -89,6 +89,10 @@ def recipes(
     from dm_common.recipes import shape_text, terms_of
     from dm_common.ros import qos
 
+    of_building = {"curvatures": curvatures, "conic": conic, "zernike": zernike, "tolerance": tolerance}
+    of_building |= {"max-maps": max_maps, "take-over": take_over}
+    if show and (given := next((name for name, value in of_building.items() if value), "")):
+        raise typer.BadParameter(f"--list and --{given}: only one of them; --list builds nothing")
     try:
         shapes = [terms_of(text) for text in zernike or ()] or [[]]
     except ValueError as error:
