@@ -63,7 +63,7 @@ def served(domain: int, folder: Path) -> Iterator[str]:
             env=outside_pytest() | {"ROS_DOMAIN_ID": str(domain)},
         )
     try:
-        wait_until(lambda: answers(address), 60, "the console to answer")
+        wait_until(lambda: answers(address), 120, "the console to answer")
         yield address
     finally:
         process.terminate()

@@ -65,15 +65,15 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "degauss": (
         action.Degauss,
         (
-            "steps: 4",
+            "steps: 10",
             "amplitude: .nan",
             "amplitude: .inf",
             "amplitude: -0.5",
             "amplitude: 1.5",
             "steps: 100000",
-            "steps: 4, end_signals: [36 x 0.0]",
-            "steps: 4, end_signals: [37 x .nan]",
-            "steps: 4, end_signals: [37 x 2.0]",
+            "steps: 10, end_signals: [36 x 0.0]",
+            "steps: 10, end_signals: [37 x .nan]",
+            "steps: 10, end_signals: [37 x 2.0]",
         ),
     ),
     "hold_mirror": (

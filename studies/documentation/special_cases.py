@@ -12,7 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 _HELD = {
     "set_signals": "signals: [37 x 0.0], {}",
     "actuator_command": "signals: [37 x 0.0], {}",
-    "degauss": "steps: 4, {}",
+    "degauss": "steps: 10, {}",
     "set_focus": "request: {{curvature: 0.02, {}}}",
     "focus_request": "curvature: 0.02, {}",
     "flatten": "{}",
