@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -44,6 +45,12 @@ def test_wrong_gains_are_corrected_within_five_maps(solver: Solver, gain: float)
     errors = [step.max_zernike for step in result.steps]
     assert result.converged, errors
     assert result.best.max_zernike == min(errors) < 1e-2 * errors[0]
+
+
+def test_neighbours_at_their_limit_do_not_shrink_the_whole_shape() -> None:
+    tight = make_solver("bounded", MODEL, replace(LIMITS, neighbour_difference=0.366))
+    plant = LinearPlant(0.65 * (1.0 + 0.03 * SPREAD))
+    assert converge(tight, FocusTarget(0.05), plant, LoopOptions(1e-9, 8)).converged
 
 
 def test_backlash_does_not_make_it_diverge(solver: Solver) -> None:

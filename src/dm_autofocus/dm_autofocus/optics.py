@@ -105,7 +105,7 @@ class FocusOptics:
             raise OpticsError(f"curvature = {curvature} 1/m: must be finite")
         at_pupil = self._at_pupil(curvature)
         rest = 1 - at_pupil * self.pupil_offset
-        return at_pupil / rest if rest > 0 else math.nan
+        return at_pupil / rest if rest > 0 else math.nan if at_pupil > 0 else -math.inf
 
     def distances_for(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distances [m] in focus at curvatures [1/m], any shape: inf = infinity and beyond, NaN = inside the camera.
@@ -116,7 +116,7 @@ class FocusOptics:
             at_pupil = self._at_pupil(curvature)
             rest = 1 - at_pupil * self.pupil_offset
             distance = np.where(at_pupil > 0, rest / at_pupil, np.inf)
-        ends = [curvature == -np.inf, curvature == np.inf, ~(rest > 0)]
+        ends = [curvature == -np.inf, curvature == np.inf, ~((rest > 0) | (at_pupil < 0))]
         return np.select(ends, [np.inf, -np.inf, np.nan], distance)
 
     def _at_pupil(self, curvature: Any) -> Any:

@@ -33,8 +33,11 @@ def run(search: FocusSearch, camera: DefocusedCamera, reach: float = math.inf) -
             search.refuse()
             continue
         visited.append(search.current.step.curvature)
-        image = camera.expose(visited[-1])
-        search.feed(tenengrad(image) if search.current.step.measured else None, (image,))
+        if search.current.step.measured:
+            image = camera.expose(visited[-1])
+            search.feed(tenengrad(image), (image,))
+        else:
+            search.feed(None)
     return visited
 
 
@@ -240,6 +243,9 @@ def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: Def
     assert FocusSearch(CONFIG, "the focal length is not known", 0.0).reason == "the focal length is not known"
     search = FocusSearch(CONFIG, model, 0.0)
     search.sweep("the mirror's hysteresis is not known", math.inf)
-    visited = run(search, DefocusedCamera(clouds(), 0.01))
+    camera = DefocusedCamera(clouds(), 0.01)
+    visited = run(search, camera)
     assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.01, abs=DEPTH)
     assert visited.count(LOW) >= 3
+    # In the units of the images: tracking compares the next ones with it.
+    assert search.current.peak.sharpness == pytest.approx(tenengrad(camera.expose(0.01)), rel=0.1)

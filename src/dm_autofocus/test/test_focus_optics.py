@@ -88,6 +88,8 @@ def test_distances_count_from_the_reference_point() -> None:
     plain, offset = FocusOptics(), FocusOptics(pupil_offset=0.5)
     assert offset.curvature_for(dioptre_of(9.5)) == pytest.approx(plain.curvature_for(dioptre_of(10.0)))
     assert math.isnan(offset.dioptre_for(2.0)), "focused 0.25 m before the pupil: inside the camera"
+    before, far = FocusOptics(relay_magnification=5.0, pupil_offset=-0.5), np.array([-0.05])
+    assert before.dioptre_for(-0.05) == -before.distances_for(far)[0] == -math.inf, "beyond infinity, not too near"
 
 
 def test_zero_and_infinity_both_mean_infinity() -> None:

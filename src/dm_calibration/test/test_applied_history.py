@@ -185,3 +185,13 @@ def test_what_another_mirror_held_is_not_held_against_this_one(history: AppliedH
         Driver(followed).degauss(40_000.0)
     forgotten, expected = (each.settled(40_010.0, 1.0).effective for each in (history, fresh))
     np.testing.assert_allclose(forgotten, expected, atol=1e-12)
+
+
+def test_a_report_counts_as_heard_once_it_is_followed(
+    history: AppliedHistory, driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who waits for it, in another thread, asks for the state at once."""
+    heard: list[bool] = []
+    monkeypatch.setattr(history._observer, "observe", lambda _report: heard.append(history.heard_since(10.0)))
+    driver.go(10.0, 0.2)
+    assert heard == [False] and history.heard_since(10.0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.displaced import described
 from dm_calibration.recalibration.drift import Displaced, Drift, DriftRates
+from dm_calibration.recalibration.map_listener import MapListener
 from dm_calibration.recalibration.updates import InUse, RecalibrationManager, UpdateOptions, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import HASH, read_image, write_image
@@ -544,3 +547,24 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
         updates.take(bench.measure("bad"), bench.settled())
         assert len(read_checks(file)) == taken
     assert read_checks(tmp_path / "none.csv") == []
+
+
+def test_what_a_map_shows_while_the_message_is_made_is_published_too(
+    updates: RecalibrationManager, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener = cast(Any, MapListener.__new__(MapListener))
+
+    class Meanwhile:
+        """Another thread takes a map in as soon as what is in use was read."""
+
+        mirror_changed = False
+
+        @property
+        def in_use(self) -> InUse:
+            listener._dirty = True
+            return in_use(updates)
+
+    listener._updates, listener._temperatures = Meanwhile(), SimpleNamespace(published=lambda: np.nan)
+    monkeypatch.setattr(MapListener, "_doubts", lambda _listener: [])
+    listener.amend(calibration_message(in_use(updates).calibration, None, "mirror", 1.0))
+    assert listener._dirty

@@ -55,8 +55,8 @@ class AppliedHistory:
         Raises:
             ValueError: as :meth:`HysteresisObserver.observe`; what was heard before is forgotten.
         """
-        self._heard = report.heard
         self._observer.observe(report)
+        self._heard = report.heard  # who waits for it in another thread finds it followed
 
     def heard_since(self, time: float) -> bool:
         """Whether the driver has reported at or after `time` (s), so that a move until then would be known."""

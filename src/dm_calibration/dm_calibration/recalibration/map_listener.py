@@ -110,8 +110,8 @@ class MapListener:
 
     def amend(self, message: CalibrationMsg) -> None:
         """Put what maps have shown since into the message of the calibration in use."""
+        self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
         if (kept := self._updates.in_use) is not None:
-            self._published_at, self._dirty = time.monotonic(), False
             put_updates(message, kept, self._temperatures.published(), self._doubts(), self._updates.mirror_changed)
 
     @property

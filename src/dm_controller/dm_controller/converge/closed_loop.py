@@ -216,9 +216,10 @@ def converge(
             break
         if creep is not None:
             drift = response(model, creep.foreseen())
-        better = solver.correct(signals, error + drift)
-        # Beyond the full step only as far as the limits go.
-        signals = solver.limited(signals + scale * damping * (better.signals - signals)).signals
+        better, limits = solver.correct(signals, error + drift).signals, solver.limits
+        further = np.clip(signals + scale * damping * (better - signals), limits.low, limits.high)
+        # Beyond the full step only as far as the limits go; to draw neighbours together would shrink the whole shape.
+        signals = further if limits.allow_neighbours(further) else better
         if used_up:
             break
     if signals is not steps[-1].signals:

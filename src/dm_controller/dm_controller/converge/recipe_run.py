@@ -143,7 +143,7 @@ class RecipeRun:
         return ErrorCode.OK, ""
 
     def _options(self, goal: Any) -> BuildOptions:
-        """What the goal asks for, 0 = configured. Raises ValueError naming what makes no sense."""
+        """What the goal asks for, 0 = configured."""
         values = self._values
         maps = goal.max_maps or values["recipes.max_maps"]
         # At least four rounds: without a model, hysteresis makes each correction miss by some share of itself.
