@@ -165,6 +165,32 @@ def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, 
     assert one.files == [tmp_path / "next.dat"]
 
 
+def test_a_file_from_before_the_request_is_not_its_measurement_however_late_it_is_noticed(
+    tmp_path: Path, bench: Any
+) -> None:
+    one = bench(tmp_path)
+    busy, go_on, results = threading.Event(), threading.Event(), []
+
+    def read_slowly(path: Path) -> None:
+        one.files.append(path)
+        busy.set()
+        go_on.wait(20)
+
+    one.acquisition._on_file = read_slowly
+    (tmp_path / "first.dat").write_bytes(MAP)
+    busy.wait(20)
+    (tmp_path / "before.dat").write_bytes(MAP)
+    thread = threading.Thread(target=lambda: results.append(one.acquisition.acquire(20)))
+    thread.start()
+    wait_until(lambda: one.acquisition._waiting is not None, what="the request")
+    go_on.set()
+    wait_until(lambda: len(one.files) == 2 or results, what="the file from before")
+    (tmp_path / "after.dat").write_bytes(MAP)
+    thread.join(20)
+    assert results[0].surface.file == str(tmp_path / "after.dat")
+    assert one.files == [tmp_path / "first.dat", tmp_path / "before.dat"]
+
+
 def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
     with pytest.raises(Refusal, match="no new map file"):
         bench(tmp_path).acquisition.acquire(0.2)

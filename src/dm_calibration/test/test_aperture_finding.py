@@ -53,6 +53,8 @@ def test_rectangular_field_gets_its_inscribed_circle() -> None:
     assert (found.centre_x_px, found.centre_y_px) == pytest.approx((59.5, 49.5), abs=0.6)
     assert found.radius_px == pytest.approx(30, abs=0.6)
     assert framed[found.disc(framed.shape)].all()
+    slanted = np.add.outer(-0.1 * np.arange(480), np.arange(640.0)) < 456  # one edge is no rim
+    assert find_aperture(slanted).radius_px == pytest.approx(240, abs=1.5)
 
 
 def test_two_mirrors_in_view_are_refused() -> None:

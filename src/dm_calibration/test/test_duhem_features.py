@@ -55,8 +55,9 @@ def test_weights_are_those_of_the_normal_equations() -> None:
     columns = np.einsum("mfn,nd->mdnf", features, gains).reshape(40 * 6, -1)
     normal = columns.T @ columns + np.kron(between, np.linalg.inv(root @ root.T))
     expected = np.linalg.solve(normal, columns.T @ left.ravel()).reshape(ACTUATORS, 3).T
-    found = weights_of(features, left, gains, root, (own, common))
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    for begin in (np.zeros_like(expected), expected + 1.0):
+        found = weights_of(features, left, gains, root, (own, common), begin)
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("own", [True, False])

@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,18 @@ def test_asc_header_texts_may_be_damaged(tmp_path: Path) -> None:
 def test_asc_that_is_not_whole_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
     with pytest.raises(MapFileError, match=words):
         read_map(write(tmp_path, "bad.asc", content))
+
+
+def test_a_text_of_more_numbers_than_pixels_is_refused_before_all_are_taken_apart(tmp_path: Path) -> None:
+    content = text_header(1, 1).encode() + b"#\n" + 300_000 * b"11 " + b"#\n"
+    path = write(tmp_path, "long.asc", content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(MapFileError, match="more than 1 values, must be 1"):
+            read_map(path)
+        assert tracemalloc.get_traced_memory()[1] < 8 * len(content)
+    finally:
+        tracemalloc.stop()
 
 
 XYZ = np.array([[0.5, -0.25, np.nan], [0.0, 1.5, 2.0]])

@@ -78,6 +78,8 @@ def test_facts_of_a_fits_file(tmp_path: Path) -> None:
         "DATE-OBS": "2015-04-24T19:34:52",
         "WAVELEN": None,
         "PUPLSCAL": None,
+        "CDELT1": 1.0,  # without the other axis and a unit of it they tell nothing
+        "CUNIT1": "mm",
     }
     found = read_map(write(tmp_path, "a.fits", fits_bytes(SAG, **cards)))
     assert (found.instrument, found.time_stamp, found.wavelength, found.pitch) == ("Hara's", 1429904092.0, 0.0, None)

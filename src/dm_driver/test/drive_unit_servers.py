@@ -215,12 +215,12 @@ class Edac40TcpUnit(DriveUnit):
 class Edac40UdpUnit(DriveUnit):
     kind = "edac40_udp"
 
-    def __init__(self, discovery: bool = True) -> None:
+    def __init__(self, discovery: bool = True, copies: int = 1) -> None:
         super().__init__()
         self.port = 0
         self.discovery_port = 0
         self.questions: list[bytes] = []
-        self._discovery = discovery
+        self._discovery, self._copies = discovery, copies
         self._sockets: list[socket.socket] = []
 
     @property
@@ -251,7 +251,8 @@ class Edac40UdpUnit(DriveUnit):
                 else:
                     self.questions.append(data)
                     if data == b"Discovery: Who is out there?":
-                        ready.sendto(b"EDAC40".ljust(15) + b"\r\n" + MAC + b"\r\n", sender)
+                        for _ in range(self._copies):
+                            ready.sendto(b"EDAC40".ljust(15) + b"\r\n" + MAC + b"\r\n", sender)
 
 
 class UsbDac40Unit(DriveUnit):

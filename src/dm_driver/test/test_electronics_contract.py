@@ -228,3 +228,12 @@ def test_udp_without_discovery_notices_a_closed_port() -> None:
             unit.unplug()
             fail_soon(lambda: electronics.write(codes, wired))
             assert not electronics.is_open
+
+
+def test_answers_that_came_twice_are_no_sign_of_life_later() -> None:
+    with Edac40UdpUnit(copies=2) as unit, make_electronics("edac40_udp", settings_of(unit)) as electronics:
+        for _ in range(100):
+            electronics.check()
+            time.sleep(0.005)
+        unit.unplug()
+        fail_soon(electronics.check, 2.5)  # a hundred old answers would last longer

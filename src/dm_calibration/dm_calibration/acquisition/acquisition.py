@@ -6,12 +6,12 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
+from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch, Signature
 from dm_calibration.acquisition.inotify import ClosedFiles
 from dm_calibration.acquisition.trigger import PLACEHOLDER, run_trigger
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
@@ -111,7 +111,7 @@ class Acquisition:
         self._thread: threading.Thread | None = None
         self._handover = threading.Lock()
         self._waiting: queue.SimpleQueue[Path] | None = None
-        self._waiting_since = 0.0
+        self._before: set[Signature] = set()
         self._numbers = count(1)
 
     @property
@@ -156,7 +156,7 @@ class Acquisition:
             output = self._new_name(watch)
             taken = self._trigger(output, trigger_s)
             return Acquired(*self._expected_file(output, deadline), taken)
-        with self._arrivals() as arrivals:
+        with self._arrivals(watch) as arrivals:
             triggered = self._trigger(None, trigger_s) if self.settings.trigger_command else None
             return Acquired(*self._next_file(watch, arrivals, deadline), triggered)
 
@@ -210,11 +210,13 @@ class Acquisition:
             time.sleep(_POLL_OUTPUT_S)
 
     @contextmanager
-    def _arrivals(self) -> Iterator[queue.SimpleQueue[Path]]:
+    def _arrivals(self, watch: FolderWatch) -> Iterator[queue.SimpleQueue[Path]]:
         """Where the next file in the folder arrives that is written from now on."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
-            self._waiting, self._waiting_since = arrivals, time.monotonic()
+            self._waiting, self._before = arrivals, set()
+            with suppress(OSError):  # a folder that comes later
+                self._before = set(watch.signatures().values())
         try:
             yield arrivals
         finally:
@@ -269,8 +271,8 @@ class Acquisition:
 
     def _hand_over(self, event: FileEvent) -> None:
         with self._handover:
-            # A file from before the request shows the mirror as it was then.
-            if self._waiting is not None and event.written >= self._waiting_since:
+            # A file from before the request shows the mirror as it was then, however late it is noticed.
+            if self._waiting is not None and event.signature not in self._before:
                 self._waiting.put(event.path)
                 self._waiting = None  # one file per request
                 return

@@ -32,13 +32,10 @@ class _Candidate:
 
 
 class FileEvent(NamedTuple):
-    """A file that is ready, or refused with the reason.
-
-    `written` is the monotonic time at which its last change was seen.
-    """
+    """A file that is ready, or refused with the reason, and what it looked like then."""
 
     path: Path
-    written: float
+    signature: Signature
     refused: str = ""
 
 
@@ -73,7 +70,7 @@ class FolderWatch:
         Raises:
             OSError: the folder cannot be read now; what is known is kept.
         """
-        listed = self._list()
+        listed = self.signatures()
         if self._known is None:
             self._known = {name: _Candidate(signature, now, done=True) for name, signature in listed.items()}
         known = {name: candidate for name, candidate in self._known.items() if name in listed}
@@ -84,7 +81,7 @@ class FolderWatch:
                 known[name] = _Candidate(signature, now)
             elif not candidate.done and now - candidate.since >= self._stable_time:
                 candidate.done = True
-                ready.append((signature.modified_ns, self._judge(name, candidate.since)))
+                ready.append((signature.modified_ns, self._judge(name, signature)))
         self._known = known
         return [event for _time, event in sorted(ready)]
 
@@ -105,14 +102,18 @@ class FolderWatch:
             candidate = self._known.get(name)
             if candidate is None or candidate.signature != signature:
                 candidate = self._known[name] = _Candidate(signature, now)
-            event = self._judge(name, now)
+            event = self._judge(name, signature)
             if not candidate.done and not event.refused and is_complete(event.path):
                 candidate.done = True
                 ready.append(event)
         return ready
 
-    def _list(self) -> dict[str, Signature]:
-        """Signatures of the matching names; for links, of what they point to."""
+    def signatures(self) -> dict[str, Signature]:
+        """Of the matching names that are there now; for links, of what they point to.
+
+        Raises:
+            OSError: the folder cannot be read now.
+        """
         found = {}
         with os.scandir(self.folder) as entries:
             for entry in entries:
@@ -128,16 +129,16 @@ class FolderWatch:
     def _matches(self, name: str) -> bool:
         return not name.startswith(".") and any(fnmatch.fnmatchcase(name.lower(), p) for p in self._patterns)
 
-    def _judge(self, name: str, written: float) -> FileEvent:
+    def _judge(self, name: str, signature: Signature) -> FileEvent:
         path = self.folder / name
         try:
             target = path.resolve(strict=True)
             if not target.is_relative_to(self.folder.resolve()):
-                return FileEvent(path, written, "a symbolic link that leads out of the watched folder")
+                return FileEvent(path, signature, "a symbolic link that leads out of the watched folder")
             if not stat.S_ISREG(target.stat().st_mode):
-                return FileEvent(path, written, "not a regular file")
+                return FileEvent(path, signature, "not a regular file")
             if path.is_symlink() and target.parent == self.folder.resolve() and self._matches(target.name):
-                return FileEvent(path, written, f"a link to {target.name}, which is taken under its own name")
+                return FileEvent(path, signature, f"a link to {target.name}, which is taken under its own name")
         except OSError as error:
-            return FileEvent(path, written, f"{error.strerror}")
-        return FileEvent(target if path.is_symlink() else path, written)
+            return FileEvent(path, signature, f"{error.strerror}")
+        return FileEvent(target if path.is_symlink() else path, signature)

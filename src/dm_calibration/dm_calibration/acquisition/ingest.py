@@ -27,7 +27,7 @@ from dm_common.optics.zernike import basis
 from dm_common.values import live_parameter, parameter, real, reals, switch, text
 
 #: Maps are searched for phase steps where the terms leave more than this at a sampling point, in wavelengths; a step of
-#: a fringe leaves more wherever it ends.
+#: a fringe leaves more wherever it ends, and goes unseen only where its region lies between the points.
 STEP_SHARE = 0.125
 #: A file whose pitch differs by more than this from the one that is known better is of another zoom.
 ZOOM_SHARE = 0.05

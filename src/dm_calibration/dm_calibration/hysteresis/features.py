@@ -16,8 +16,8 @@ EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
-#: Residual of the solved weights, relative: effective signals are within 1e-7 then.
-SOLVED = 1e-7
+#: Residual of the solved weights, relative: effective signals are within 1e-6 then.
+SOLVED = 1e-6
 #: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
 _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Patterns that are kept of the prior.
@@ -214,7 +214,9 @@ def follow(
     return result, state
 
 
-def weights_of(features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float]) -> Floats:
+def weights_of(
+    features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float], begin: Floats
+) -> Floats:
     """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
 
     Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
@@ -222,6 +224,7 @@ def weights_of(features: Floats, left: Floats, gains: Floats, root: Floats, betw
 
     Args:
         between: own, common.
+        begin: (F, N) weights to begin with.
     """
     own, common = between
     count, actuators = features.shape[1:]
@@ -245,5 +248,6 @@ def weights_of(features: Floats, left: Floats, gains: Floats, root: Floats, betw
     shape = (right.size, right.size)
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
     tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
-    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, M=preconditioner, **tolerance)
+    first = np.linalg.solve(root, begin).T.ravel()
+    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, first, M=preconditioner, **tolerance)
     return np.asarray(root @ unknown.reshape(actuators, count).T)

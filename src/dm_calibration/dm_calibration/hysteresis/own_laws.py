@@ -183,7 +183,7 @@ class OwnLaws:
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            patterns = self._patterns(crept[keep], gains / scatter, measured, free, root)
+            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, root)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -237,10 +237,12 @@ class OwnLaws:
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
         return self.run.responses.scatter(size)
 
-    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats) -> Floats:
+    def _patterns(
+        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats
+    ) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between)
+        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between, begin[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
@@ -254,9 +256,10 @@ class OwnLaws:
         elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
         left = measured - (position[keep] + self._creep * elements[:, ELEMENTS].sum(axis=1)) @ gains
         elements, left = without(elements, free), without(left, free)
-        found = weights_of(elements, left, gains, self._creep_root, self._creep_between)
-        found[ELEMENTS] += self._creep
-        return found
+        expected = np.zeros_like(creep)
+        expected[ELEMENTS] = self._creep
+        begin = creep - expected
+        return expected + weights_of(elements, left, gains, self._creep_root, self._creep_between, begin)
 
 
 def _alike(actuators: int, spread: float) -> tuple[float, float]:

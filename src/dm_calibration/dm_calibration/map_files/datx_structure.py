@@ -125,7 +125,7 @@ def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
         MapFileError: they do, and not as the values of another dataset.
     """
     start = surface.id.get_offset()
-    if start is None:  # in chunks
+    if start is None or surface.dtype.kind != "f":  # in chunks, or whole numbers, which have no such value
         return
     end, row = start + surface.id.get_storage_size(), surface.shape[1] * surface.dtype.itemsize
     one = np.asarray(no_data, surface.dtype).tobytes()

@@ -155,7 +155,7 @@ def _pitch(header: Header) -> float | None:
     """m per pixel, from PUPLSCAL or from CDELT with CUNIT in a length; None = not told."""
     if "PUPLSCAL" in header:
         return check_pitch(_real(header, "PUPLSCAL", 0.0))
-    if "CDELT1" not in header or "CUNIT1" not in header:
+    if not {"CDELT1", "CDELT2", "CUNIT1", "CUNIT2"} <= header.keys():
         return None
     x, y = (
         abs(_real(header, f"CDELT{axis}", 0.0)) * _unit(str(header.get(f"CUNIT{axis}", "")), f"CUNIT{axis}")

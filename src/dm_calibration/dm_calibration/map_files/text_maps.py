@@ -84,9 +84,10 @@ def numbers(text: bytes, name: str, expected: int, dtype: type) -> NDArray[Any]:
     """
     if 2 * expected > len(text) + 1:  # a number takes a digit and a separator
         raise MapFileError(f"{name}: {len(text)} characters cannot hold {expected} values; the file is truncated")
-    tokens = text.split()
+    tokens = text.split(None, expected)  # more would claim twenty times the memory that the file takes
     if len(tokens) != expected:
-        raise MapFileError(f"{name}: {len(tokens)} values, must be {expected}")
+        many = f"more than {expected}" if len(tokens) > expected else len(tokens)
+        raise MapFileError(f"{name}: {many} values, must be {expected}")
     if max(map(len, tokens), default=0) > _LONGEST_NUMBER:
         raise MapFileError(f"{name}: holds a word of more than {_LONGEST_NUMBER} characters, must be numbers")
     try:

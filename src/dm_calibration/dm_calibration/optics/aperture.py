@@ -98,7 +98,8 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
     x, y = _rim(region)
     if len(x) >= _FEWEST_RIM_POINTS:
         circle, scatter = _fit_circle(x, y)
-        if scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
+        far = circle.radius_px > math.hypot(*region.shape)  # a slanted edge, which is no rim
+        if not far and scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
             return circle
     circle = _inscribed_circle(region)
     if region[[0, -1]].any() or region[:, [0, -1]].any():  # cut off there, as a rectangular field is
