@@ -22,6 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import (
     ActuatorCommand,
+    ActuatorHysteresis,
     ActuatorState,
     Calibration,
     MirrorInfo,
@@ -210,6 +211,22 @@ def test_a_difference_of_one_bit_is_found(run_and_bag: tuple[RecordedRun, Any, B
     finally:
         live.influence_sag[1234] = before
     assert "influence_sag" in COMPARED
+
+
+def test_maps_after_a_run_do_not_hide_what_it_published(
+    run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
+) -> None:
+    run, live, _bag = run_and_bag
+    checked = replace(run.maps[-1], stamp_ns=run.maps[-1].stamp_ns + 10**9)
+    later = session_messages(replace(run, moves=(), maps=(checked,)))[3:]  # without mirror, state and feedback
+    bag = write_bag(tmp_path / "longer", [*session_messages(run), ("/calibration", live), *later])
+    assert read_session(bag).published.id == "live"
+
+
+def test_the_whole_law_is_compared() -> None:
+    fields = {f"hysteresis.{name}" for name in ActuatorHysteresis.get_fields_and_field_types()}
+    beside = {"law", "powers", "crept_at", "held_out_max_zernike", "unknown_sigma"}
+    assert fields - set(COMPARED) == {f"hysteresis.{name}" for name in beside}
 
 
 def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path) -> None:

@@ -40,8 +40,15 @@ COMPARED = (
     "hysteresis.play_weight",
     "hysteresis.duhem_slope",
     "hysteresis.duhem_weight",
+    "hysteresis.fading_rate",
     "hysteresis.fading_weight",
     "hysteresis.creep_rate",
+    "hysteresis.creep_time",
+    "hysteresis.creep_spectrum",
+    "hysteresis.lag_spectrum",
+    "hysteresis.creep_slope",
+    "hysteresis.crept",
+    "hysteresis.creep_covariance",
 )
 
 
@@ -109,9 +116,9 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
     run = RecordedRun(mirror, tuple(moves), maps, chosen.plan, _model(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
-    last = max((measured.stamp_ns for measured in maps), default=-1)
+    stamps = {measured.stamp_ns for measured in maps}  # also of maps taken since the run
     known = {message.id for message in before}
-    made = [each for each in during["calibration"] if each.id not in known and stamp_ns(each.header.stamp) == last]
+    made = [each for each in during["calibration"] if each.id not in known and stamp_ns(each.header.stamp) in stamps]
     return Session(run, parameters, made[0] if made else None, remarks)
 
 
