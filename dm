@@ -101,6 +101,7 @@ def forget_other_ros() -> None:
     others = tuple(filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
     if str(VENV) in others:
         return  # this is a ./dm inside a ./dm exec
+    os.environ.pop("COLCON_PREFIX_PATH", None)  # colcon would chain its workspaces to what it builds here
     for name in [name for name in os.environ if name.endswith("PATH") and name != "PATH"]:
         entries = os.environ[name].split(os.pathsep)
         os.environ[name] = os.pathsep.join(entry for entry in entries if not entry.startswith(others))
@@ -226,9 +227,12 @@ def set_up_environment() -> None:
     check_tools()
     # A half-made environment is worthless, and one of other pins must not linger: begin anew. What was built belongs
     # to the old one, and to the folder it was built in, which CMake writes to even from a copy elsewhere.
-    for folder in (VENV, ROOT / "build", ROOT / "install"):
-        if folder.exists():
-            shutil.rmtree(folder)
+    if VENV.exists() or BUILD_STAMP.exists():  # else a build is somebody's own, by colcon without this script
+        for folder in (ROOT / "build", ROOT / "install", VENV):
+            if folder.is_symlink():
+                folder.unlink()
+            elif folder.exists():
+                shutil.rmtree(folder)
     log = ROOT / "log"
     extra = ["--system-site-packages"] if sourced_jazzy() else []
     run_logged([sys.executable, "-m", "venv", *extra, str(VENV)], log / "venv.log", "making .venv")

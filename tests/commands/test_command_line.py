@@ -344,9 +344,9 @@ def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
 
 def test_the_age_of_a_calibration_is_of_the_time_of_the_bench() -> None:
     """In a simulation time begins at 0."""
-    made, state = Calibration(id="c"), ActuatorState()
-    made.header.stamp.sec, state.header.stamp.sec = 40, 100
-    assert "maps 60 s ago" in verb_status._calibration(made, state)
+    made = Calibration(id="c")
+    made.header.stamp.sec = 40
+    assert "maps 60 s ago" in verb_status._calibration(made, 100)
 
 
 def test_status_knows_no_negative_zero() -> None:

@@ -37,7 +37,7 @@ def _key(keys: Collection[str], node: str, namespace: str) -> str:
     own = [key for key in of_node if "*" not in key and (not namespace or places[key] in ("", namespace))]
     if not own and namespace and namespace in places.values():
         return f"/{namespace}/{node}"
-    return (own or of_node or [f"/**/{node}"])[0]
+    return (own or [key for key in of_node if "*" in key] or [f"/**/{node}"])[0]
 
 
 def _with_value(text: str, key: str, name: str, value: Any) -> str:

@@ -75,6 +75,8 @@ def test_of_two_mirrors_in_a_file_one_changes() -> None:
     assert after == before
     assert "/**/interferometer:" in edited(text, CHANGES, "third"), "it has no section of its own"
     assert yaml.safe_load(edited(text, CHANGES, "third"))["/**/pdm_driver"]["ros__parameters"]["a"] == 1
+    other = "/left/interferometer: {ros__parameters: {b: 1}}\n"
+    assert edited(f"{other}/**/pdm_driver: {{ros__parameters: {{a: 1}}}}\n", CHANGES, "third").startswith(other)
 
 
 def test_what_is_no_parameter_file_is_refused() -> None:

@@ -36,7 +36,7 @@ UPDATE_CALIBRATION = Fields({"holder": text("")})
 STORE_RECIPES = Fields(
     {
         "recipes.calibration_id": text(""),
-        "recipes.degauss_steps": whole(0, 1, 10_000),
+        "recipes.degauss_steps": whole(0, 5, 10_000),
         "recipes.interpolation_error": real(0.0, 0.0, 1.0, "m"),
     }
 )

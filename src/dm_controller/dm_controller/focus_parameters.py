@@ -69,8 +69,8 @@ PARAMETERS: Final = (
     ),
     live(
         "condition.degauss_steps",
-        whole(0, 0, 10000),
-        "half-swings of the degauss that conditions; 0 = as the recipes were built, without recipes as the driver does",
+        whole(0, 5, 10000, zero="as the recipes were built, without recipes as the driver does"),
+        "half-swings of the degauss that conditions",
     ),
     live("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for that degauss"),
     live("hold.enable", switch(True), "correct a shape for creep while it is held"),

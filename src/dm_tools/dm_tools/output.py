@@ -5,6 +5,7 @@ import math
 import os
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,8 +44,12 @@ def output_file(path: Path | None) -> Path | None:
     """`path`, where a file can be written, which a long run must not end with. Raises typer.BadParameter."""
     if path is None or path == STANDARD_OUTPUT or path.is_relative_to("/dev"):
         return path
-    nearest = next(folder for folder in path.absolute().parents if folder.exists())  # those below it are made
-    if path.is_dir() or not nearest.is_dir() or not os.access(nearest, os.W_OK):
+    free = False
+    with suppress(PermissionError):  # below a folder that cannot be searched
+        nearest = next(folder for folder in path.absolute().parents if folder.exists())  # those below it are made
+        inside = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
+        free = path.is_fifo() or (inside and not path.is_dir())
+    if not free:
         raise typer.BadParameter(f"{path}: must be a file, in a folder in which one can be written")
     return path
 

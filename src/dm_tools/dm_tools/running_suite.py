@@ -135,8 +135,8 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
         raise
 
 
-def hear_health(client: DeformableMirrorClient) -> dict[str, Any]:
-    """{node: its latest status on /diagnostics}, filled from now on."""
+def hear_health(client: DeformableMirrorClient, times: list[int] | None = None) -> dict[str, Any]:
+    """{node: its latest status on /diagnostics}, filled from now on, as are `times` of the bench, s."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     heard: dict[str, Any] = {}
@@ -146,6 +146,8 @@ def hear_health(client: DeformableMirrorClient) -> dict[str, Any]:
             place, _, name = status.name.rpartition("/")
             if place == client.node.get_namespace().lstrip("/"):
                 heard[name] = status
+                if times is not None and name in NEEDED:
+                    times.append(message.header.stamp.sec)
 
     client.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
     return heard

@@ -106,7 +106,7 @@ def certificate(
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
-        ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
+        ("range of curvatures", reach if np.isfinite(low) else "neither flat nor mid range is within reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),

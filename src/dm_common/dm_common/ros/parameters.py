@@ -110,7 +110,8 @@ class Parameter:
         if value.kind is float and bounded:
             descriptor.floating_point_range = [FloatingPointRange(from_value=value.low, to_value=value.high)]
         if value.kind is int and bounded:
-            descriptor.integer_range = [IntegerRange(from_value=int(value.low), to_value=int(value.high))]
+            low = 0 if value.zero else int(value.low)  # what lies between, `check` refuses
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=int(value.high))]
         return descriptor
 
 

@@ -27,7 +27,8 @@ MISSING_S = 10.0
 def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     """Say on one screen what runs, where the mirror stands, what it promises, and what to do next."""
     with running_suite(namespace) as client:
-        health = hear_health(client)
+        times: list[int] = []
+        health = hear_health(client, times)
         client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
         client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), MISSING_S - REPORT_S)
         client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
@@ -43,7 +44,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
-        "calibration": _calibration(heard, state),
+        "calibration": _calibration(heard, times[-1] if times else time.time()),
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),
@@ -89,11 +90,11 @@ def _now(by: str, shape: SettledShape | None, state: Any) -> str:
     return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature: without a bound{moving}"
 
 
-def _calibration(calibration: Any, state: Any = None) -> str:
-    """The calibration in a line; its age by the last report of the driver, for the bench may have a time of its own."""
+def _calibration(calibration: Any, now: float = 0.0) -> str:
+    """The calibration in a line; its age at `now`, s of the time of the bench, which may have one of its own."""
     if calibration is None or not calibration.id:
         return "not heard" if calibration is None else "none in use"
-    age = (time.time() if state is None else state.header.stamp.sec) - calibration.header.stamp.sec
+    age = now - calibration.header.stamp.sec
     doubtful = sum(grade != "good" for grade in calibration.actuator_grade)
     law = f"law {calibration.hysteresis.law}" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
     return (
