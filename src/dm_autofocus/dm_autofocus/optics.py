@@ -105,7 +105,9 @@ class FocusOptics:
             raise OpticsError(f"curvature = {curvature} 1/m: must be finite")
         at_pupil = self._at_pupil(curvature)
         rest = 1 - at_pupil * self.pupil_offset
-        return at_pupil / rest if rest > 0 else math.nan if at_pupil > 0 else -math.inf
+        if rest > 0:
+            return at_pupil / rest
+        return math.nan if at_pupil > 0 else -math.inf
 
     def distances_for(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distances [m] in focus at curvatures [1/m], any shape: inf = infinity and beyond, NaN = inside the camera.

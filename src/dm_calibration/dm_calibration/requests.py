@@ -3,6 +3,7 @@
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_calibration.influence.fit import METHODS
 from dm_calibration.procedure.plan import PlanKind
+from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.optics.zernike import TERMS
 from dm_common.values import Fields, real, reals, text, texts, whole
 
@@ -36,7 +37,7 @@ UPDATE_CALIBRATION = Fields({"holder": text("")})
 STORE_RECIPES = Fields(
     {
         "recipes.calibration_id": text(""),
-        "recipes.degauss_steps": whole(0, 5, 10_000),
+        "recipes.degauss_steps": whole(0, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX),
         "recipes.interpolation_error": real(0.0, 0.0, 1.0, "m"),
     }
 )

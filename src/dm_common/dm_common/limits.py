@@ -12,6 +12,11 @@ from dm_common import Floats
 SLACK = 1e-9
 #: Signals closer to a limit than this count as standing at it.
 AT_LIMIT = 1e-6
+#: Half-swings of a degauss that wipes the hysteresis. n of them leave up to 1 / (2 n) of the first; where that is more
+#: than a tenth, the history that follows is not the one of a mirror at rest that everybody goes by.
+DEGAUSS_STEPS_MIN = 5
+#: Most half-swings: smaller ones than these leave would be below a step of the electronics.
+DEGAUSS_STEPS_MAX = 10000
 
 
 @dataclass(frozen=True)

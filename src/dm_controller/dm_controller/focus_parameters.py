@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Final
 
+from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.ros.parameters import AUTOSTART, Parameter, live
 from dm_common.values import Fields, real, reals, switch, text, whole
 from dm_controller.creep_hold import PERIOD_S
@@ -34,7 +35,11 @@ LOOP_PARAMETERS = (
     Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
     Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
     live("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed"),
-    Parameter("recipes.degauss_steps", whole(100, 5, 10000), "half-swings of the degauss that recipes begin with"),
+    Parameter(
+        "recipes.degauss_steps",
+        whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX),
+        "half-swings of the degauss that recipes begin with",
+    ),
     Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
 
@@ -69,7 +74,12 @@ PARAMETERS: Final = (
     ),
     live(
         "condition.degauss_steps",
-        whole(0, 5, 10000, zero="as the recipes were built, without recipes as the driver does"),
+        whole(
+            0,
+            DEGAUSS_STEPS_MIN,
+            DEGAUSS_STEPS_MAX,
+            zero="as the recipes were built, without recipes as the driver does",
+        ),
         "half-swings of the degauss that conditions",
     ),
     live("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for that degauss"),

@@ -6,17 +6,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.values import real, whole
 from dm_driver.moves import Kind, Move
 from dm_driver.safety_limiter import DriverLimits, Shape
 
 #: A degauss of at least this share of the full range leaves nothing of what was before.
 FULL_CYCLE = 0.999
-#: n half-swings leave up to 1 / (2 n) of the first in the hysteresis; where that is more than a tenth, the history that
-#: follows is not the one of a mirror at rest that everybody goes by.
-STEPS_MIN = 5
-#: Most half-swings: smaller ones than these leave would be below a step of the electronics.
-STEPS_MAX = 10000
 
 
 def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: int, end: Shape) -> Iterator[Shape]:
@@ -62,7 +58,7 @@ def degauss_move(
     middle = limits.middle
     largest = limits.half_range
     real(0.0, 0.0, largest).check("amplitude", amplitude)
-    whole(0, 1, STEPS_MAX).check(name, steps)
+    whole(0, 1, DEGAUSS_STEPS_MAX).check(name, steps)
     swing = amplitude or largest
     # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
     # On a slow line the last step of each of these ways takes as long as a whole one.
@@ -76,5 +72,5 @@ def degauss_move(
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
     # A smaller cycle leaves what wider swings have written.
-    wipes = swing >= FULL_CYCLE * largest and steps >= STEPS_MIN
+    wipes = swing >= FULL_CYCLE * largest and steps >= DEGAUSS_STEPS_MIN
     return Move(Kind.DEGAUSS, end, waypoints, wipes, steps, duration)

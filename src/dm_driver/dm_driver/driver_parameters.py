@@ -3,9 +3,9 @@
 import math
 from typing import Final
 
+from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.ros.parameters import AUTOSTART, REQUIRED, Parameter, live, parameters_of
 from dm_common.values import real, reals, switch, text, whole, wholes
-from dm_driver.degauss import STEPS_MAX, STEPS_MIN
 from dm_driver.electronics import BACK_ENDS, ElectronicsSettings
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.volts import LAWS, LINEAR
@@ -81,7 +81,7 @@ PARAMETERS: Final = (
         "Empty = keep nothing.",
     ),
     Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
-    Parameter("degauss.steps", whole(100, STEPS_MIN, STEPS_MAX), "Half-swings of a degauss."),
+    Parameter("degauss.steps", whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX), "Half-swings of a degauss."),
     live(
         "degauss.duration_max",
         real(180.0, 1.0, 3600.0, "s"),

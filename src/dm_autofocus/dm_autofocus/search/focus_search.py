@@ -50,9 +50,11 @@ class FocusSearch:
     def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
         """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured."""
         powers, seen = self._powers(images), sharpness
-        if sharpness is not None and powers is None:
+        if sharpness is None:
+            pass
+        elif powers is None:
             self._seen.clear()  # of another size than these, whose sharpness they say nothing of
-        elif sharpness is not None and powers is not None:
+        else:
             assert isinstance(self._model, DefocusModel)
             seen = self._model.sharpness(powers)
             self._seen.append((self.current.step.curvature, powers, sharpness))
