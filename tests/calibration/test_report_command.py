@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
-from dm_calibration.report.checks import DEFAULTS
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_tools.verbs import report as verb
 from dm_tools.verbs.report import find_calibration, report
@@ -51,7 +51,7 @@ def test_an_id_or_a_file_anywhere_is_found(
 ) -> None:
     assert find_calibration("older", store)[0].id == "older"
     elsewhere = CalibrationStore(tmp_path)
-    in_use = store.find("newer"), DEFAULTS, ""
+    in_use = store.find("newer"), JUDGED_BY, ""
     monkeypatch.setattr(verb, "running_calibration", lambda _namespace: in_use)  # its node has a folder of its own
     report("older", tmp_path / "out", json=tmp_path / "figures.json")
     assert json.loads((tmp_path / "figures.json").read_text())["id"] == "older"

@@ -95,6 +95,15 @@ def test_the_focus_controller_is_on_its_own() -> None:
     assert 0 < len(started) <= NODE_MODULES_MAX, sorted(started)
 
 
+def test_the_calibration_node_starts_without_what_draws_reports() -> None:
+    script = (
+        "import sys, dm_calibration.calibration_node; "
+        "print(*({'matplotlib', 'scipy.stats', 'statsmodels'} & {*sys.modules}))"
+    )
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert not output.split()  # together they would double the time that it takes
+
+
 @pytest.mark.parametrize("home", HOMES)
 def test_folders_side_by_side_import_in_no_circle(home: str) -> None:
     needs: dict[str, set[str]] = {}

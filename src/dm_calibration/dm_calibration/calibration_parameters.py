@@ -95,6 +95,13 @@ PARAMETERS = (
     ),
 )
 
+#: What a report judges a calibration by: these parameters of the node, here their defaults.
+JUDGED_BY = {
+    parameter.name: parameter.default
+    for parameter in PARAMETERS
+    if parameter.name in ("calibrated_error_max", "updates.stale_after", "updates.surprises_max")
+}
+
 
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     """Options of a fit from the node's parameters; `method` empty = the default."""

@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
@@ -27,7 +28,7 @@ from dm_calibration.recalibration.update_storage import write_updates
 from dm_calibration.recalibration.updates import SUFFIX, RecalibrationManager, UpdateOptions
 from dm_calibration.report import content, content_hysteresis
 from dm_calibration.report.certificate import certificate, curvatures, keep_people, people
-from dm_calibration.report.checks import DEFAULTS, valid_until
+from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
@@ -187,7 +188,7 @@ def test_message_and_certificate_agree(
     grades = np.array([grade] + [0] * 36, dtype=np.uint8)
     judged = replace(calibration, fit=replace(calibration.fit, grades=grades, held_out_max_zernike=promised))
     message = calibration_message(judged, None, "mirror", error_max)
-    values = DEFAULTS | {"calibrated_error_max": error_max}
+    values = JUDGED_BY | {"calibrated_error_max": error_max}
     assert (message.quality == Capabilities.CALIBRATED) is good
     assert ("<td>calibrated</td>" in html_page("", [certificate(judged, {}, (), values)])) is good
 
@@ -208,7 +209,7 @@ def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibrat
         "./dm status",
     ):
         assert expected in first
-    patient = html_page("", sections(calibration, file, DEFAULTS | {"updates.surprises_max": 4})[:1])
+    patient = html_page("", sections(calibration, file, JUDGED_BY | {"updates.surprises_max": 4})[:1])
     assert "calibrate again" not in patient and "Goes on without actuator 5" in patient
 
 

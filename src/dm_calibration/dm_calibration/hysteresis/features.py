@@ -129,38 +129,40 @@ def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
     return slope
 
 
-def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Iterator[Floats]:
-    """What the creep elements have followed of `values` (M, ...) at each `time` (M,) s; all before `start` was 0.
+def creep_lags(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Iterator[Floats]:
+    """How far the creep elements lag behind `values` (M, ...) at each `time` (M,) s; all before `start` was 0.
 
     Args:
         moved: (M,) s, when each row began to stand, between the measurements; None = right after the one before.
 
     Yields:
-        (J, ...), a row after the other.
+        (J, ...), a row after the other: one array, which the next row changes.
     """
     shape = (len(CREEP_TIMES), *(1,) * (values.ndim - 1))
     moved = np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
     still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
-    state, before = np.zeros((len(CREEP_TIMES), *values.shape[1:])), np.zeros(values.shape[1:])
-    for row, now in enumerate(values):
-        state = state - before
-        state *= still[2 * row].reshape(shape)
-        state += before - now
-        state *= still[2 * row + 1].reshape(shape)
-        state += now
-        yield state
+    lag, before = np.zeros((len(CREEP_TIMES), *values.shape[1:])), np.zeros(values.shape[1:])
+    for now, until_move, since in zip(values, still[::2], still[1::2], strict=True):
+        lag *= (until_move * since).reshape(shape)
+        lag += since.reshape(shape) * (now - before)
+        yield lag
         before = now
 
 
+def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
+    """(M, J, ...) what the creep elements have followed of `values`; see :func:`creep_lags`."""
+    return np.stack([now - lag for now, lag in zip(values, creep_lags(values, time, start, moved), strict=True)])
+
+
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None, weight: Floats = EVEN) -> Floats:
-    """What creep adds to features (M, ...); see :func:`creep_states`.
+    """What creep adds to features (M, ...); see :func:`creep_lags`.
 
     Args:
         weight: (J, ...) of the creep elements; of an even spectrum, per unit of creep rate, where not given.
     """
-    result = np.empty_like(features)
-    for row, state in enumerate(creep_states(features, time, start, moved)):
-        result[row] = np.einsum("j...,j...->...", weight, state)
+    result = weight.sum(axis=0) * features
+    for row, lag in enumerate(creep_lags(features, time, start, moved)):
+        result[row] -= np.einsum("j...,j...->...", weight, lag)
     return result
 
 

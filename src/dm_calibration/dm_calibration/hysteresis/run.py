@@ -98,7 +98,7 @@ class Run:
     def creep_states(self, values: Floats) -> Floats:
         """(M, J, ...) what the creep elements have followed of `values` (M, ...) at each map."""
         return np.concatenate(
-            [list(creep_states(values[rows], self.time[rows], start, self._moved(rows))) for rows, start in self.parts]
+            [creep_states(values[rows], self.time[rows], start, self._moved(rows)) for rows, start in self.parts]
         )
 
     def crept(self, features: Floats, weight: Floats = EVEN) -> Floats:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
-from dm_calibration.report.checks import DEFAULTS, valid_until
+from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
@@ -85,7 +86,7 @@ def certificate(
     calibration: Calibration,
     names: Mapping[str, str],
     checks: Sequence[Check] = (),
-    values: Mapping[str, Any] = DEFAULTS,
+    values: Mapping[str, Any] = JUDGED_BY,
     since: Sequence[str] = (),
 ) -> Section:
     """Verdict, range, promise, term and names.
@@ -93,7 +94,7 @@ def certificate(
     Args:
         names: of `operator` and `instrument`.
         checks: since then, oldest first.
-        values: of the parameters JUDGED_BY.
+        values: of the parameters named in JUDGED_BY.
         since: what checks have shown that it holds no more, or in part only: sentences.
     """
     reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from scipy.stats import theilslopes
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import PARAMETERS
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Picture, Section, Table
@@ -18,13 +18,10 @@ DAY_S = 86400.0
 TREND_MIN, TREND_SPAN_S = 5, DAY_S
 #: Checks in the table: the last ones.
 SHOWN = 20
-#: Parameters of the node `calibration` that a report judges by.
-JUDGED_BY = ("calibrated_error_max", "updates.stale_after", "updates.surprises_max")
-DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS if parameter.name in JUDGED_BY}
 
 
 def valid_until(
-    checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = DEFAULTS
+    checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = JUDGED_BY
 ) -> tuple[float, str]:
     """Until when a calibration is valid, s since the epoch, and why; the next is to be made by then.
 
@@ -34,7 +31,7 @@ def valid_until(
         checks: oldest first.
         promised: 95 % bound on the largest coefficient error, m.
         measured_s: time of the last map of the calibration.
-        values: of the parameters JUDGED_BY.
+        values: of the parameters named in JUDGED_BY.
     """
     agreed = [check.time for check in checks if check.accepted]
     stale = max([measured_s, *agreed]) + values["updates.stale_after"]
@@ -51,12 +48,12 @@ def valid_until(
     return reached, f"the error grows by {per_month} and reaches the promise then"
 
 
-def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = DEFAULTS) -> Section:
+def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = JUDGED_BY) -> Section:
     """Table, chart and a sentence on each question.
 
     Args:
         checks: at least one, oldest first.
-        values: of the parameters JUDGED_BY.
+        values: of the parameters named in JUDGED_BY.
     """
     last, measured, promised = checks[-1], calibration.stamp_ns * 1e-9, calibration.promise
     days = max(last.time - measured, 1.0) / DAY_S

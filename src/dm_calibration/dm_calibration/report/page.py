@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
@@ -28,7 +29,7 @@ class Written(NamedTuple):
 
 
 def sections(
-    calibration: Calibration, file: Path | None = None, values: Mapping[str, Any] = checks.DEFAULTS
+    calibration: Calibration, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
 ) -> list[Section]:
     """All sections of the report of `calibration`, which was read from `file`; `values` of what it is judged by.
 
@@ -64,13 +65,13 @@ def sections(
 
 
 def write_report(
-    calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = checks.DEFAULTS
+    calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
 ) -> Written:
     """Write ``<id>.html`` and ``<id>.pdf`` into `folder`; each is there whole or not at all.
 
     Args:
         file: that the calibration was read from, for its SHA-256.
-        values: of the parameters that it is judged by, `checks.JUDGED_BY`.
+        values: of the parameters that it is judged by, JUDGED_BY.
 
     Raises:
         OSError: `file` cannot be read, or `folder` not written to.

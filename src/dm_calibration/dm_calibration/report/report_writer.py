@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from dm_calibration.report.checks import DEFAULTS, JUDGED_BY
+from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.store.calibration_store import CalibrationStore
 
 #: Longest time for one report, s of wall time; a loaded machine may need a multiple of the usual few.
@@ -32,7 +32,7 @@ class ReportWriter:
         values: of the node's parameters; those of JUDGED_BY count as they are when a report is begun.
     """
 
-    def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = DEFAULTS) -> None:
+    def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = JUDGED_BY) -> None:
         self._publish, self._values = publish, values
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reports")

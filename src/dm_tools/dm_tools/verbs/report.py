@@ -21,19 +21,19 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
 
     No file: it has none, or runs elsewhere. The parameters as they are by default: nothing runs.
     """
-    from dm_calibration.report.checks import DEFAULTS, JUDGED_BY
+    from dm_calibration.calibration_parameters import JUDGED_BY
     from dm_client import DeformableMirrorClient, DeformableMirrorError
     from dm_tools.parameter_changes import get_parameter
     from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), FIND_S):
-            return None, DEFAULTS, ""
+            return None, JUDGED_BY, ""
         client.wait(lambda: "calibration" in client.messages, BUSY_S)
         message = client.messages.get("calibration")
         if message is None:
-            return None, DEFAULTS, ""
-        values = DEFAULTS
+            return None, JUDGED_BY, ""
+        values = JUDGED_BY
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)
             values = {name: get_parameter(client, "calibration", name) for name in JUDGED_BY}
         file = Path(message.file)
@@ -101,8 +101,8 @@ def report(
 
     Reads the stored file; needs no running nodes, but goes by the parameters of those that run for that mirror.
     """
+    from dm_calibration.calibration_parameters import JUDGED_BY
     from dm_calibration.report.certificate import keep_people, people
-    from dm_calibration.report.checks import DEFAULTS
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
 
@@ -116,7 +116,7 @@ def report(
         store = folder_with(calibration, STORES if file_in_use is None else (file_in_use.parent, *STORES))
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:
-        values = DEFAULTS  # another mirror's limits are none of this one
+        values = JUDGED_BY  # another mirror's limits are none of this one
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
     if console.is_terminal and sys.stdin.isatty():
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
