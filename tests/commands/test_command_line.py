@@ -34,7 +34,7 @@ from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.replay import replay
-from dm_tools.verbs.report import folder_with, newest_store
+from dm_tools.verbs.report import folder_with
 from dm_tools.verbs.up import first_command, lacks, only_suite
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -286,10 +286,10 @@ def test_what_stands_is_read_from_the_controllers_health() -> None:
 
 def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:
     older, newer = tmp_path / "a", tmp_path / "b"
-    assert newest_store((older, newer)) == older
+    assert folder_with("", (older, newer)) == older
     newer.mkdir()
     (newer / "c.h5").touch()
-    assert newest_store((older, newer)) == newer
+    assert folder_with("", (older, newer)) == newer
     older.mkdir()
     (older / "b.h5").touch()
     os.utime(older / "b.h5", (0, 0))

@@ -25,7 +25,9 @@ from std_srvs.srv import SetBool
 from dm_autofocus import CameraFocusClient
 from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_client.connection import checked
 from dm_common.ros import qos
+from dm_common.ros.clients import call
 from dm_common.ros.domains import own_domain
 from fault_injection.rigs.forked_node import ForkedSuite
 from support import fast_bench, wait_until
@@ -221,8 +223,8 @@ def test_taking_over_is_explicit_and_ends_the_run(bench: Bench) -> None:
 def test_whoever_holds_the_mirror_has_every_request_carried_out(bench: Bench) -> None:
     client = bench.client
     held = HoldMirror.Request(holder="my_stack", purpose="tracking", lease=60.0)
-    client.clients["hold_mirror"] = client.node.create_client(HoldMirror, "hold_mirror")
-    client.call("hold_mirror", held)
+    hold = client.node.create_client(HoldMirror, "hold_mirror")
+    checked(call(hold, held, 10.0))
     assert client.wait(lambda: client.actuator_state.holder == "my_stack")
     for refused in (client.flatten, client.update_calibration, client.degauss, lambda: client.converge(0.01)):
         with pytest.raises(DeformableMirrorError, match="my_stack has held the mirror") as busy:
@@ -236,7 +238,7 @@ def test_whoever_holds_the_mirror_has_every_request_carried_out(bench: Bench) ->
     assert client.wait(lambda: client.actuator_state.holder == "")
     held.operation = HoldMirror.Request.RENEW
     with pytest.raises(DeformableMirrorError, match="focus_controller has taken the mirror over"):
-        client.call("hold_mirror", held)
+        checked(call(hold, held, 10.0))
 
 
 def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:
@@ -269,7 +271,6 @@ def test_without_its_calibration_node_the_mirror_is_used_on_and_says_so(bench: B
 
 def test_an_unplugged_unit_is_known(bench: Bench) -> None:
     power = bench.client.node.create_client(SetBool, "virtual_bench/power")
-    bench.client.clients["power"] = power
     assert wait_until(power.service_is_ready)
     power.call_async(SetBool.Request(data=False))
     assert bench.client.wait(lambda: bench.client.capabilities.error_code != ErrorCode.OK, ALLOWED_S)

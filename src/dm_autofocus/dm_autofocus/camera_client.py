@@ -37,10 +37,9 @@ _OWN: dict[str, Any] = {
 class CameraFocusClient(DeformableMirrorClient):
     """A client of one mirror's nodes and of the node `autofocus` beside them, made and used as its base class."""
 
-    interfaces = DeformableMirrorClient.interfaces | _OWN
     watched = {
         **DeformableMirrorClient.watched,
-        "autofocus": (AutofocusState, "autofocus_state", qos.STATE, tuple(_OWN)),
+        "autofocus": (AutofocusState, "autofocus_state", qos.STATE, _OWN),
     }
 
     def focus_range(self) -> GetFocusRange.Response:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self, TypedDict, Unpack
 
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
     Flatten,
     IngestFile,
@@ -26,7 +26,7 @@ from dm_msgs.srv import (
 )
 from sensor_msgs.msg import Image
 
-from dm_client.connection import RESTING, WATCHED, Connection, DeformableMirrorError, Watched
+from dm_client.connection import RESTING, Connection, DeformableMirrorError, Watched
 from dm_client.fields import filled
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
@@ -37,21 +37,34 @@ TOPICS = {
     "capabilities": (Capabilities, qos.LATCHED),
     "actuator_state": (ActuatorState, qos.STATE),
 }
-INTERFACES = {
-    "set_signals": SetSignals,
-    "degauss": Degauss,
-    "set_focus": SetFocus,
-    "flatten": Flatten,
-    "ingest_file": IngestFile,
-    "measure": Measure,
-    "list_calibrations": ListCalibrations,
-    "load_calibration": LoadCalibration,
-    "update_calibration": UpdateCalibration,
-    "calibrate": Calibrate,
-    "move_focus": MoveFocus,
-    "converge": Converge,
-    "build_recipes": BuildRecipes,
+WATCHED: Watched = {
+    "pdm_driver": (MirrorInfo, "mirror_info", qos.LATCHED, {"set_signals": SetSignals, "degauss": Degauss}),
+    "interferometer": (SurfaceMapInfo, "surface_map_info", qos.STATE, {"measure": Measure, "ingest_file": IngestFile}),
+    "calibration": (
+        Calibration,
+        "calibration",
+        qos.LATCHED,
+        {
+            "calibrate": Calibrate,
+            "list_calibrations": ListCalibrations,
+            "load_calibration": LoadCalibration,
+            "update_calibration": UpdateCalibration,
+        },
+    ),
+    "focus_controller": (
+        Capabilities,
+        "capabilities",
+        qos.LATCHED,
+        {
+            "set_focus": SetFocus,
+            "flatten": Flatten,
+            "move_focus": MoveFocus,
+            "converge": Converge,
+            "build_recipes": BuildRecipes,
+        },
+    ),
 }
+INTERFACES = {name: interface for *_, served in WATCHED.values() for name, interface in served.items()}
 #: `timeout_s` for nodes that the same program has only just started, s.
 STARTING_S = 60.0
 
@@ -77,15 +90,11 @@ class DeformableMirrorClient(Connection):
         timeout_s: how long to wait for a service that should answer at once.
     """
 
-    #: What it calls, made at once.
-    interfaces: dict[str, Any] = INTERFACES
-    #: Who serves that.
+    #: The nodes that it calls.
     watched: Watched = WATCHED
 
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
-        super().__init__(
-            "dm_client", namespace, domain, TOPICS, self.interfaces, timeout_s=timeout_s, watched=self.watched
-        )
+        super().__init__("dm_client", namespace, domain, TOPICS, self.watched, timeout_s=timeout_s)
         self.start()
 
     def __enter__(self) -> Self:

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import rclpy
-from dm_msgs.msg import Calibration, Capabilities, MirrorInfo, SurfaceMapInfo
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -20,24 +19,9 @@ from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call, 
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
 
-#: By the name of the node: message type, name and profile of a topic by which it is known to live, and what it serves.
-Watched = Mapping[str, tuple[Any, str, Any, tuple[str, ...]]]
-WATCHED: Watched = {
-    "pdm_driver": (MirrorInfo, "mirror_info", qos.LATCHED, ("set_signals", "degauss")),
-    "interferometer": (SurfaceMapInfo, "surface_map_info", qos.STATE, ("measure", "ingest_file")),
-    "calibration": (
-        Calibration,
-        "calibration",
-        qos.LATCHED,
-        ("calibrate", "list_calibrations", "load_calibration", "update_calibration"),
-    ),
-    "focus_controller": (
-        Capabilities,
-        "capabilities",
-        qos.LATCHED,
-        ("set_focus", "flatten", "move_focus", "converge", "build_recipes"),
-    ),
-}
+#: By the name of the node: message type, name and profile of a topic by which it is known to live, and what it serves,
+#: {name: service or action type}.
+Watched = Mapping[str, tuple[Any, str, Any, Mapping[str, Any]]]
 #: Of a node that does not answer; TIMEOUT for the others.
 UNAVAILABLE = {
     "pdm_driver": ErrorCode.DRIVER_UNAVAILABLE,
@@ -93,11 +77,10 @@ class Connection:
         namespace: of the mirror, "" for none.
         domain: ROS domain; None = the environment's.
         topics: {name: (message type, quality of service)}, heard from the beginning.
-        interfaces: {name: service or action type}, made at once, so that the nodes have discovered them all by the
-            time the first is used.
+        watched: the nodes that it calls. Clients of all that they serve are made at once, so that the nodes have
+            discovered them by the time the first is used.
         on_message: called with topic and message in the executor's thread, after `messages` has it.
         timeout_s: how long to wait for an answer that should come at once.
-        watched: the nodes that serve the interfaces.
 
     Attributes:
         messages: {topic: latest message}.
@@ -110,10 +93,9 @@ class Connection:
         namespace: str,
         domain: int | None,
         topics: Mapping[str, tuple[Any, Any]],
-        interfaces: Mapping[str, Any],
+        watched: Watched,
         on_message: Callable[[str, Any], None] = lambda topic, message: None,
         timeout_s: float = 10.0,
-        watched: Watched = WATCHED,
     ) -> None:
         place, own = full_namespace(namespace), f"{name}_{os.getpid()}_{next(_NUMBERS)}"
         self._context = rclpy.Context()
@@ -130,10 +112,9 @@ class Connection:
         self._servers: dict[str, Liveliness] = {}
         for server, (message_type, topic, profile, served) in watched.items():
             self._servers |= dict.fromkeys(served, qos.watch(self.node, server, message_type, topic, profile))
-        for interface_name, interface in interfaces.items():
-            make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
-            self.clients[interface_name] = make(self.node, interface, interface_name)
-        self._background: BackgroundExecutor | None = None
+            for interface_name, interface in served.items():
+                make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
+                self.clients[interface_name] = make(self.node, interface, interface_name)
 
     def start(self) -> None:
         """Begin to hear; what is added to the node before misses nothing."""
@@ -141,8 +122,7 @@ class Connection:
 
     def close(self) -> None:
         """Leave the ROS graph; the mirror keeps its shape."""
-        if self._background is not None:
-            self._background.destroy_node()
+        self._background.destroy_node()
         self._context.try_shutdown()
 
     def hear(self, topic: str, message_type: Any, profile: Any) -> bool:
@@ -169,17 +149,16 @@ class Connection:
 
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
         """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
-        found: list[Any] = []
+        found: Any = None
 
         def arrived() -> bool:
-            message = self.messages.get(topic)
-            if message is not None and message.header.stamp == stamp:
-                found.append(message)  # the next one may come at any moment
-            return bool(found)
+            nonlocal found
+            found = self.messages.get(topic)  # the next one may come at any moment
+            return found is not None and bool(found.header.stamp == stamp)
 
         if not self.wait(arrived):
             raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
-        return found[0]
+        return found
 
     def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
@@ -201,11 +180,9 @@ class Connection:
 
         Ctrl-C and `stop` cancel it, so that the mirror is left safe; `identity`: see `run_goal`.
         """
-        server = self._servers.get(name)
 
         def take(feedback: Any) -> None:
-            if server is not None:
-                server.heard()  # who speaks lives, even if this process missed that on a busy machine
+            self._servers[name].heard()  # who speaks lives, even if this process missed that on a busy machine
             on_feedback(feedback)
 
         with self._answered(name) as gone:
@@ -224,14 +201,13 @@ class Connection:
     @contextmanager
     def _answered(self, name: str) -> Iterator[Callable[[], str]]:
         """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
-        server = self._servers.get(name)
-        if server is not None:
-            server.wait_for_return()
-        gone = server.since_now() if server is not None else lambda: ""
+        server = self._servers[name]
+        server.wait_for_return()
+        gone = server.since_now()
         try:
             yield gone
         except ServiceCallError as error:
             code, text = error.error_code, str(error)
-            if server is not None and (lost := gone()):
+            if lost := gone():
                 code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost}"
             raise DeformableMirrorError(code, text) from error

@@ -35,7 +35,10 @@ TOPICS = client.TOPICS | {
 }
 #: What the console has no button for.
 NOT_OFFERED = ("ingest_file", "update_calibration")
-INTERFACES = {name: interface for name, interface in client.INTERFACES.items() if name not in NOT_OFFERED}
+WATCHED = {
+    node: (kind, topic, profile, {name: served[name] for name in served if name not in NOT_OFFERED})
+    for node, (kind, topic, profile, served) in client.WATCHED.items()
+}
 #: Names of the levels of rcl_interfaces/Log.
 LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 #: Lines of the log that are kept.
@@ -74,11 +77,6 @@ class Snapshot:
     health: dict[str, DiagnosticStatus] = field(default_factory=dict)
     bench_time: float = 0.0
 
-    @property
-    def present(self) -> frozenset[str]:
-        """Names of the nodes heard lately, without the namespace."""
-        return frozenset(self.health)
-
 
 class ConsoleNode:
     """Listens to one mirror's nodes and calls them.
@@ -94,14 +92,14 @@ class ConsoleNode:
         self._timed = {f"{self._prefix}{name}" for name in NEEDED}  # others, and the simulation, may have another time
         self._stops: dict[str, threading.Event] = {}  # of the goals that run; once set they are cancelled
         self.observer = StateObserver()
-        self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
+        self._connection = Connection("dm_console", namespace, domain, TOPICS, WATCHED, self._take)
         self.node = self._connection.node
         self.log: deque[tuple[str, str, str, str]] = deque(maxlen=LOG_LINES)
         # Nodes offer their latest lines to those who come late.
         profile = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(Log, "/rosout", self._take_line, profile)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
-        self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in LONG}
+        self.watched = {name: ExternalGoals(self.node, client.INTERFACES[name], name) for name in LONG}
         self._connection.start()
 
     def _take(self, topic: str, message: Any) -> None:
@@ -165,7 +163,7 @@ class ConsoleNode:
 
         Raises Refusal with the node's sentence when the goal was refused, ended with an error or was cancelled.
         """
-        identity = INTERFACES[name].Impl.SendGoalService.Request().goal_id
+        identity = client.INTERFACES[name].Impl.SendGoalService.Request().goal_id
         identity.uuid = list(uuid.uuid4().bytes)
         watched, stop = self.watched.get(name), threading.Event()
         if watched is not None:

@@ -1,7 +1,7 @@
 """State of the bench in words: badges, what is missing, why something is not possible, diagnostics and log."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +47,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
     """Mirror, driver, calibration and history in a few words each; `doubt` = why that is not known, "" = it is."""
     mirror, state, calibration = snapshot.mirror_info, snapshot.actuator_state, snapshot.calibration
     shown = [Badge(f"{mirror.name} {mirror.serial}")] if mirror is not None else [Badge("no mirror", "bad")]
-    if "pdm_driver" not in snapshot.present or state is None:
+    if "pdm_driver" not in snapshot.health or state is None:
         shown.append(Badge("driver: not heard", "bad"))
     else:
         active = state.driver_state == ActuatorState.STATE_ACTIVE
@@ -69,9 +69,9 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
     return shown
 
 
-def missing(present: frozenset[str], mirror_known: bool) -> list[str]:
-    """What is not there, and what follows from it, in sentences."""
-    if not present & NEEDED.keys():
+def missing(present: Collection[str], mirror_known: bool) -> list[str]:
+    """What is not there of the nodes and the mirror, and what follows from it, in sentences."""
+    if not NEEDED.keys() & present:
         return ["No node of the suite is heard. Start them (./dm up) or check the namespace and the ROS domain."]
     lines = [f"The node {name} is not heard: {effect}." for name, effect in NEEDED.items() if name not in present]
     if "pdm_driver" in present and not mirror_known:
@@ -98,7 +98,7 @@ def reason_against(need: str, snapshot: Any, running: str) -> str:
         "store": ["calibration"],
     }[need]
     for name in nodes:
-        if name not in snapshot.present:
+        if name not in snapshot.health:
             return f"The node {name} is not heard."
     state = snapshot.actuator_state
     if "pdm_driver" in nodes:
@@ -139,7 +139,7 @@ def now_text(snapshot: Any) -> str:
     """Where the mirror stands, in one line."""
     state = snapshot.actuator_state
     for name in ("pdm_driver", "focus_controller"):
-        if name not in snapshot.present or state is None:
+        if name not in snapshot.health or state is None:
             return f"now: not known, {name} is not heard"
     if state.moving:
         return "now: moving"

@@ -186,9 +186,7 @@ def watched_folder(folder: Path, written: bool, made: bool) -> Finding | None:
 
 def writable_folder(folder: Path) -> Finding | None:
     """Whether a folder can be written to, or made."""
-    nearest = folder
-    while not nearest.exists() and nearest != nearest.parent:
-        nearest = nearest.parent
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
     if not nearest.is_dir():
         return Finding(f"{nearest} is not a folder", "choose another folder, or remove the file")
     if not os.access(nearest, os.W_OK | os.X_OK):

@@ -1,5 +1,6 @@
 """`dm report`: the report of a stored calibration as one HTML and one PDF file."""
 
+import math
 import os
 import sys
 import time
@@ -40,21 +41,14 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
         return file if message.file and file.is_file() else None, values, message.mirror_serial
 
 
-def newest_store(folders: Sequence[Path]) -> Path:
-    """The folder with the youngest file in it; the first when there is none in any."""
-
-    def youngest(folder: Path) -> float:
-        return max((file.stat().st_mtime for file in folder.expanduser().glob("*.h5")), default=0.0)
-
-    return max(folders, key=youngest)
-
-
 def folder_with(name: str, folders: Sequence[Path]) -> Path:
-    """The first folder with a calibration of that id, else that of the youngest file."""
-    named = (
-        folder for folder in folders if name and (folder.expanduser() / f"{name.removesuffix('.h5')}.h5").is_file()
-    )
-    return next(named, None) or newest_store(folders)
+    """The first folder with a calibration of that id, else that of the youngest file, else the first."""
+
+    def rank(folder: Path) -> float:
+        files = {file.stem: file.stat().st_mtime for file in folder.expanduser().glob("*.h5")}
+        return math.inf if name.removesuffix(".h5") in files else max(files.values(), default=0.0)
+
+    return max(folders, key=rank)
 
 
 def find_calibration(name: str, store: Any) -> tuple[Any, Path]:

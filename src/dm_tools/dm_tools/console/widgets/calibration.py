@@ -94,7 +94,7 @@ class CalibrationCard:
         self._load.allow(reason_against("store", snapshot, session.running) or unchosen)
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""
         # Also after runs that were not started here, and after the node was started again.
-        key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.present)
+        key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.health)
         if key != self._listed and key[-1] and not running:
             self._listed = key
             background_tasks.create(self._list())

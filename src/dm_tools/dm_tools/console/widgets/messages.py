@@ -53,7 +53,7 @@ class Header:
         self._cancel.allow("" if progress.can_cancel else "This operation cannot be cancelled; it ends by itself.")
         self._now.show(now_text(snapshot))
         self._outcome.show("" if running else self._session.outcome)
-        lacking = missing(snapshot.present, snapshot.mirror_info is not None)
+        lacking = missing(snapshot.health, snapshot.mirror_info is not None)
         state = snapshot.actuator_state
         if state is not None and state.error_code and state.message:
             lacking.append(f"Driver: {state.message} (error {state.error_code})")
