@@ -89,7 +89,6 @@ class PlateModel(Solver):
     """
 
     name = "plate_model"
-    source = "analytic plate model, reference 22 of [1]"
 
     def __init__(
         self,

@@ -28,7 +28,6 @@ class SparseSampling(Solver):
     """
 
     name = "sparse_sampling"
-    source = "sparse sampling, Eqs. (4) and (5)"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)

@@ -24,7 +24,6 @@ class SteepestDescent(Solver):
     """
 
     name = "steepest_descent"
-    source = "steepest descent, reference 19 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)
@@ -40,7 +39,7 @@ class SteepestDescent(Solver):
         """As in the base class, by iteration on the model."""
         self._check(wanted)
         change = self._factors * (wanted - self.offset).coefficients[PISTON_TILT:]
-        command = Command(self._start())
+        command = Command(np.zeros(self._matrix.shape[1]))
         overflow = 0.0
         for _ in range(MODEL_ITERATIONS):
             residual = change - self._matrix @ command.signals

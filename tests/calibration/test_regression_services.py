@@ -30,7 +30,7 @@ from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerService
-from dm_controller.forecast import ForecastClient, hysteresis_share, surface_control_error_rms
+from dm_controller.forecast import ForecastClient, HysteresisShare, surface_control_error_rms
 from dm_controller.planning.mirror_model import CalibratedMirror
 from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes
 from linear_mirror import RADIUS
@@ -289,9 +289,9 @@ def test_a_refusal_that_passes_does_not_end_the_forecast(observer: Observer, mon
 
 
 def test_share_of_the_hysteresis() -> None:
-    share = hysteresis_share(np.array([0.02, 0.0]), np.array([[50e-9, 60e-9], [3e-9, 5e-9]]), np.array([30e-9, 4e-9]))
+    share = HysteresisShare(np.array([0.0, 0.02]), 1e-18 * np.array([[0.0, 9.0], [1600.0, 2700.0]]))
     assert share.interval(0.02, 0.0) == pytest.approx((40e-9, np.sqrt(2700.0) * 1e-9))
-    assert share.interval(0.0, 4e-9) == pytest.approx((4e-9, 5e-9))  # never below the model's own
+    assert share.interval(0.0, 4e-9) == pytest.approx((4e-9, 5e-9))
 
 
 def test_modelled_error_agrees_with_the_calibrations_own() -> None:

@@ -152,7 +152,7 @@ class AutofocusNode(ManagedNode):
 
 def main() -> int:
     """Entry point of the node."""
-    return run_node(AutofocusNode, sys.argv)
+    return run_node(AutofocusNode)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -249,9 +249,9 @@ class CalibrationNode(ManagedNode):
         return Health(level, "; ".join((f"calibration {calibration.id}", *warnings)), values | figures)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Run the node."""
-    return run_node(CalibrationNode, args)
+    return run_node(CalibrationNode)
 
 
 if __name__ == "__main__":

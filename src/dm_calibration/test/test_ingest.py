@@ -18,7 +18,7 @@ from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedErr
 from dm_calibration.optics.orientation import Orientation
 from dm_common.measurement import Measurement
 from dm_common.optics.conic import conic_sag, pitch_of_sphere
-from dm_common.optics.zernike import basis, curvature_of
+from dm_common.optics.zernike import DEFOCUS, basis, curvature_of_defocus
 from map_fixtures import NO_DATA, WAVELENGTH, dat_bytes, disc_counts, write_datx
 
 SIZE, PITCH = 120, 2e-4
@@ -135,8 +135,9 @@ def test_a_sphere_of_known_radius_gives_the_lateral_scale(surface: Path) -> None
     pitch, share = pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, -1.5)
     assert pitch == pytest.approx(true, rel=2e-5) and share < 3e-5
     wrong, right = (seen(0.05, IngestSettings(pitch=each)) for each in (0.0, pitch))
-    assert curvature_of(wrong.coefficients, wrong.radius) == pytest.approx(0.05 * 1.003**2, rel=1e-4)
-    assert curvature_of(right.coefficients, right.radius) == pytest.approx(0.05, rel=1e-4)
+    for seen_as, expected in ((wrong, 0.05 * 1.003**2), (right, 0.05)):
+        found = curvature_of_defocus(seen_as.coefficients[DEFOCUS], seen_as.radius)
+        assert found == pytest.approx(expected, rel=1e-4)
     for radius, text in ((1.5, "a sphere of 1.5 m, and the map shows -"), (-3.0, "not a sphere of -3 m")):
         with pytest.raises(ValueError, match=text):
             pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, radius)

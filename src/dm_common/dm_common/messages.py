@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 
 def doubles(values: Floats) -> array[float]:
     """`values`, flattened row by row, as a buffer that a float64[] field takes without looking at each element."""
-    buffer = array("d")
-    buffer.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    return buffer
+    return array("d", np.asarray(values, dtype=np.float64).tobytes())
 
 
 def taken(source: Any, *names: str) -> dict[str, Any]:

@@ -59,15 +59,14 @@ class Conditioning:
 
         As the last one took; before the first from the way, which is half the span per half-swing, and the slew rate.
         """
-        at = active.planner.slew_rate, active.mirror.limits.half_range
-        if at != self._learnt_at:  # another mirror, or another configuration
-            self._learnt, self._learnt_at = {}, at
+        slew_rate, half_span = active.planner.slew_rate, active.mirror.limits.half_range
+        if (slew_rate, half_span) != self._learnt_at:  # another mirror, or another configuration
+            self._learnt, self._learnt_at = {}, (slew_rate, half_span)
         if steps in self._learnt:
             return self._learnt[steps]
         for known, seconds in self._learnt.items():
             if known and steps:
                 return seconds * steps / known
-        slew_rate, half_span = active.planner.slew_rate, active.mirror.limits.half_range
         if not math.isfinite(slew_rate):
             return 0.0
         return half_span * ((steps or STEPS_ASSUMED) + 2) / slew_rate

@@ -161,9 +161,7 @@ class DriverMonitor:
 
     def check(self, request: FocusRequest, now: float) -> None:
         """Raise what `refusal` gives, or what `held` does."""
-        if (refusal := self.refusal(now)) is not None:
-            raise refusal
-        if (refusal := self.held(request)) is not None:
+        if refusal := self.refusal(now) or self.held(request):
             raise refusal
 
     def held(self, request: FocusRequest) -> Refusal | None:

@@ -189,7 +189,7 @@ class FocusControllerNode(FocusHost):
 
 def main() -> int:
     """Entry point of the node."""
-    return run_node(FocusControllerNode, sys.argv)
+    return run_node(FocusControllerNode)
 
 
 if __name__ == "__main__":

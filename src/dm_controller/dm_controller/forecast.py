@@ -48,19 +48,6 @@ class HysteresisShare:
         return float(np.sqrt(lower)), float(np.sqrt(upper))
 
 
-def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> HysteresisShare:
-    """From answers of `predict_error` to the share of hysteresis in them.
-
-    Args:
-        curvature: (K,) 1/m of the commands.
-        answers: (K, 2) m, lower, upper.
-        modelled: (K,) m, :func:`surface_control_error_rms` of the same commands.
-    """
-    order = np.argsort(curvature)
-    square = np.maximum(np.square(answers) - np.square(modelled)[:, np.newaxis], 0.0)
-    return HysteresisShare(curvature[order], square[order])
-
-
 def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
     """Rms surface control error that figure and influence function alone predict: sag less nominal surface G s, m."""
     from dm_controller.solvers.base import rms_sag  # a start does not wait for it
@@ -138,4 +125,5 @@ class ForecastClient:
             return
         answers[row] = answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():
-            self.share = hysteresis_share(grid, answers, modelled)
+            square = np.square(answers) - np.square(modelled)[:, np.newaxis]
+            self.share = HysteresisShare(grid, np.maximum(square, 0.0))

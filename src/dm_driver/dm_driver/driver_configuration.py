@@ -13,7 +13,8 @@ from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.values import from_values
 from dm_driver.degauss import degauss_move
-from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
+from dm_driver.electronics import BACK_ENDS
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import OutputStage, wiring_table
@@ -62,7 +63,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         timeout_s=values["electronics.timeout"],
         frame=from_values(FrameFormat, values if kind == "framed_serial" else {}, "framed_serial."),
     )
-    back_end = make_electronics(kind, settings)  # finds a missing setting now
+    back_end = BACK_ENDS[kind](settings)  # finds a missing setting now
     unit = tuple(values[f"volts.{name}"] for name in ("dac_at_zero", "dac_at_full", "amplifier_gain"))
     if not back_end.knows_volts and unit != (0.0, 1.0, 1.0):
         raise ValueError(
@@ -119,7 +120,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         output=OutputStage(scale, channel_of_actuator, back_end.channels),
         safe_shape=safe_shape,
         settings=settings,
-        electronics=make_electronics(kind, settings),
+        electronics=BACK_ENDS[kind](settings),
     )
 
 
@@ -127,13 +128,8 @@ def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.fl
     x = np.array(values["mirror.actuator_x"], dtype=np.float64)
     y = np.array(values["mirror.actuator_y"], dtype=np.float64)
     if x.size == 0 and y.size == 0:
-        return hexagonal_positions(
-            actuators,
-            values["mirror.pitch"],
-            values["mirror.start_angle"],
-            values["mirror.clockwise"],
-            values["mirror.reflected"],
-        )
+        pattern = (values[f"mirror.{name}"] for name in ("pitch", "start_angle", "clockwise", "reflected"))
+        return hexagonal_positions(actuators, *pattern)
     for name, ordinates in (("mirror.actuator_x", x), ("mirror.actuator_y", y)):
         if ordinates.size != actuators:
             raise ValueError(

@@ -6,7 +6,8 @@ from typing import Final
 from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.ros.parameters import AUTOSTART, REQUIRED, Parameter, live, parameters_of
 from dm_common.values import real, reals, switch, text, whole, wholes
-from dm_driver.electronics import BACK_ENDS, ElectronicsSettings
+from dm_driver.electronics import BACK_ENDS
+from dm_driver.electronics.base import ElectronicsSettings
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.volts import LAWS, LINEAR
 from dm_driver.safety_limiter import DriverLimits

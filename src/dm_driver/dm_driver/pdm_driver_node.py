@@ -8,7 +8,6 @@ reports the lost link and keeps trying, so that the order in which things are sw
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
@@ -254,9 +253,9 @@ class PdmDriverNode(ManagedNode):
         return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused, self._gate.trouble)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Run the node."""
-    return run_node(PdmDriverNode, args)
+    return run_node(PdmDriverNode)
 
 
 if __name__ == "__main__":

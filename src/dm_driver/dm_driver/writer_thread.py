@@ -26,8 +26,6 @@ CHECK_PERIOD_S = 0.25
 #: only to close it, and a datagram's "port unreachable" takes a moment to return.
 CONFIRM_S = 0.05
 
-Listener = Callable[[WriterState, bool], None]
-
 
 class WriterThread:
     """Keep the link and write what the queue holds; `dm_driver.actuator_writer` puts moves there.
@@ -50,7 +48,7 @@ class WriterThread:
         output: OutputStage,
         limiter: SafetyLimiter,
         safe_shape: Shape,
-        listener: Listener = lambda state, edge: None,
+        listener: Callable[[WriterState, bool], None] = lambda state, edge: None,
         watchdog_s: float = 0.0,
         stamp_ns: Callable[[], int] = time.time_ns,
         last: LastShape | None = None,

@@ -16,7 +16,8 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.degauss import degauss_move
-from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
+from dm_driver.electronics import Edac40Tcp
+from dm_driver.electronics.base import ElectronicsSettings
 from dm_driver.last_shape import LastShape
 from dm_driver.moves import Kind, Move, Outcome, WriterState
 from dm_driver.output.volts import VoltScale

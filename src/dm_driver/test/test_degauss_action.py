@@ -39,13 +39,14 @@ def carried_out(
     server = SimpleNamespace(preempted=lambda _handle: overtaken)
     monkeypatch.setattr(degauss_action, "WorkerActionServer", lambda *_arguments, **_keywords: server)
     none: Any = None
-    action = degauss_action.DegaussAction(none, CommandGate(hold, lambda _text, _took_over: None), {})
+    gate = CommandGate(hold, lambda _text, _took_over: None)
+    action = degauss_action.DegaussAction(none, gate, {})
 
-    def begin(_goal: Any) -> Any:
+    def begin(*_arguments: Any) -> Any:
         writer.begun = handle.is_cancel_requested = True
         return writer, Move(Kind.DEGAUSS, none)
 
-    monkeypatch.setattr(action, "_begin", begin)
+    monkeypatch.setattr(gate, "attempt", begin)
     return action._carry_out(handle)
 
 

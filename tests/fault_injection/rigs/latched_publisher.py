@@ -28,7 +28,7 @@ class LatchedPublisher(Node):
 
 def main() -> int:
     """Until SIGINT or SIGTERM."""
-    return run_node(LatchedPublisher, sys.argv)
+    return run_node(LatchedPublisher)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def conic_coefficients(curvature: float, conic_constant: float, radius: float) -
 def disc_coefficients(
     sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """(21,) Born & Wolf coefficients of `sag`, a function of points of the unit disc, by least squares over it."""
+    """(..., 21) Born & Wolf coefficients of `sag`, from points (Q,) of the unit disc to (..., Q), by least squares."""
     x, y, projection = _quadrature()
     return sag(x, y) @ projection
 

@@ -123,17 +123,13 @@ def basis(x: ArrayLike, y: ArrayLike) -> Floats:
     return result
 
 
-def curvature_of(coefficients: ArrayLike, radius: float) -> float:
-    """Curvature (1/m, positive = concave) of the paraboloid with the defocus of `coefficients` (21,), m.
+def curvature_of_defocus(coefficient: float, radius: float) -> float:
+    """Curvature c (1/m, positive = concave) of the paraboloid c r^2 / 2 that has this defocus over an aperture.
 
     Args:
+        coefficient: of the defocus, m.
         radius: of the aperture, m.
     """
-    return curvature_of_defocus(float(_checked(coefficients)[DEFOCUS]), radius)
-
-
-def curvature_of_defocus(coefficient: float, radius: float) -> float:
-    """Curvature (1/m) of the paraboloid c r^2 / 2 whose defocus over an aperture's radius (m) is `coefficient` (m)."""
     return 4.0 * coefficient / radius**2
 
 

@@ -89,7 +89,8 @@ class BenchServices:
             feedback.message = text
             handle.publish_feedback(feedback)
 
-        self.waiting, self._said = publish, ""
+        self.waiting = publish
+        self._said = ""
 
     @contextmanager
     def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:

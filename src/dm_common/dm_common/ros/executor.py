@@ -28,7 +28,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -59,16 +59,15 @@ DROPPED_S = 0.09
 PAUSES_S = (0.3, 1.0, 3.0)
 
 
-def make_executor(*nodes: Node) -> Executor:
-    """Return the suite's executor with `nodes` (at least one, all of one context) added."""
+def make_executor(node: Node) -> Executor:
+    """Return the suite's executor with `node` added."""
     warnings.filterwarnings("ignore", "failed to send response", RuntimeWarning)  # see `until_discovered`
-    executor = EventsExecutor(context=nodes[0].context)
-    for node in nodes:
-        executor.add_node(node)
+    executor = EventsExecutor(context=node.context)
+    executor.add_node(node)
     return executor
 
 
-def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
+def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
     """Dispatch events until the ROS context is shut down or `until()` is true.
 
     A callback that raises is logged with its traceback and the loop goes on. Lifecycle nodes start by themselves
@@ -80,7 +79,7 @@ def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
         for service in node.services:
             if "send_response" not in vars(service):  # else it only hands the request on, see `worker.WorkerService`
                 service.send_response = until_discovered(service.send_response)
-    while context.ok() and not (until is not None and until()):
+    while context.ok() and not until():
         try:
             executor.spin_once(timeout_sec=WAKE_PERIOD_S)
         except (KeyboardInterrupt, ExternalShutdownException):
@@ -189,7 +188,7 @@ def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
                 lock.unlink()
 
 
-def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+def run_node(make_node: Callable[[], Node]) -> int:
     """Run one node as a process: `main()` of every node calls this.
 
     The node's `make_safe()`, if it has one, runs after the loop has ended and before anything is destroyed, with SIGINT
@@ -206,7 +205,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # whoever started this may have kept them back until now
         remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals(executor)
@@ -225,9 +224,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
         for number in STOPPING:
             signal.signal(number, signal.SIG_IGN)
         if node is not None:
-            make_safe = getattr(node, "make_safe", None)
-            if make_safe is not None:
-                make_safe()
+            getattr(node, "make_safe", lambda: None)()
             if executor is not None:
                 executor.shutdown(WAKE_PERIOD_S)
         rclpy.try_shutdown()  # worker threads know by it that the node is about to go

@@ -16,7 +16,6 @@ from dm_common.ros.parameters import Parameter, declare
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
-STALE = DiagnosticStatus.STALE
 #: How often health is published, s.
 PERIOD_S = 1.0
 

@@ -52,8 +52,10 @@ class ConvergeRun:
         return outcome, _result(steps, error_code, message)
 
     def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> tuple[LoopResult, Limits]:
-        bench = self._bench
-        options = self._options(goal)
+        bench, values = self._bench, self._values
+        options = LoopOptions(  # 0 = as configured
+            goal.tolerance or values["converge.tolerance"], goal.max_maps or values["converge.max_maps"]
+        )
         target = bench.target(goal.request)
         solver = self._solver(goal.method)
         bench.check_ready()
@@ -74,12 +76,6 @@ class ConvergeRun:
         # A mirror that is not known to stand somewhere gives no move to foresee creep from.
         applied = bench.applied()
         return None if applied is None else Creep.of_rate(self._values["converge.creep"], applied, bench.now)
-
-    def _options(self, goal: Any) -> LoopOptions:
-        """What the goal asks for, 0 = configured."""
-        return LoopOptions(
-            goal.tolerance or self._values["converge.tolerance"], goal.max_maps or self._values["converge.max_maps"]
-        )
 
     def _solver(self, method: str) -> Solver:
         active = self._bench.active_calibration()

@@ -15,7 +15,6 @@ from rclpy.client import Client
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.creep_record import rested
-from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import shape_text
 from dm_common.ros.clients import ServiceCallError, call
@@ -84,14 +83,11 @@ class RecipeRun:
             feedback.residual_rms, feedback.max_zernike = step.rms, step.max_zernike
             handle.publish_feedback(feedback)
 
+        state, stands = bench.hysteresis(), bench.applied()
+        if state is None and stands is not None:  # as if it had long rested where the driver says that it stands
+            state = rested(planner.law, stands, bench.now(), active.middle)
         builder = RecipeBuilder(
-            planner,
-            bench,
-            bench.now,
-            options,
-            state=bench.hysteresis() or self._guess(planner.law, bench.now(), active.middle),
-            on_step=report,
-            cancelled=bench.cancelled,
+            planner, bench, bench.now, options, state=state, on_step=report, cancelled=bench.cancelled
         )
         code, text = self._build(builder, targets)
         recipes, result.maps = builder.recipes, builder.maps
@@ -152,11 +148,6 @@ class RecipeRun:
         return BuildOptions(
             tolerance, maps, average, float(values["converge.settle_time"]), values["reachable_tolerance"]
         )
-
-    def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
-        """The mirror long rested where the driver says it stands; None when it does not say."""
-        applied = self._bench.applied()
-        return None if applied is None else rested(law, applied, now, middle)
 
     def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
         """What the calibration node answers: an ErrorCode and a sentence.

@@ -13,7 +13,7 @@ As a short power series in the radius, all that is linear in the sag of a conic 
 terms are exact to rounding.
 """
 
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
@@ -56,11 +56,7 @@ def series_sag(x: Floats, y: Floats) -> Floats:
 @cache
 def series_coefficients() -> Floats:
     """(21, ORDERS) Born & Wolf coefficients per amplitude, by least squares over the full disc."""
-    return np.column_stack([disc_coefficients(partial(_power, n)) for n in range(1, ORDERS + 1)])
-
-
-def _power(order: int, x: Floats, y: Floats) -> Floats:
-    return np.asarray((x**2 + y**2) ** order)
+    return disc_coefficients(lambda x, y: series_sag(x, y).T).T
 
 
 class ClosedForm:

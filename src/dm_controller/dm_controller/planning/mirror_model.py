@@ -133,6 +133,13 @@ def coefficient_rows(influence: Floats) -> Floats:
     return rows
 
 
+def reduced(sag: Floats, weights: Floats, removed: Floats) -> Floats:
+    """Sag (P,) or (P, N) times `weights` (P,), with the span of `removed` (P, k, orthonormal) projected out."""
+    weighted = (sag.T * weights).T
+    result: Floats = weighted - removed @ (removed.T @ weighted)
+    return result
+
+
 class CalibratedMirror:
     """Solves focus targets on an influence model inside limits.
 
@@ -165,11 +172,10 @@ class CalibratedMirror:
         self.model, self.limits, self.axis = model, limits, np.array(axis, dtype=float)
         self._weights = np.sqrt(model.sample_weight)
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
-        self._tilt_free = self._terms[:, :PISTON_TILT]
         self._coefficient_rows = coefficient_rows(model.influence_zernike[PISTON_TILT:])
-        reduced = self._reduce(model.influence_sag, self._tilt_free)
-        self.sag_root: Floats = np.linalg.qr(reduced)[1]
-        response = np.linalg.norm(reduced, axis=0)
+        bent = reduced(model.influence_sag, self._weights, self._terms[:, :PISTON_TILT])
+        self.sag_root: Floats = np.linalg.qr(bent)[1]
+        response = np.linalg.norm(bent, axis=0)
         self.tilt = None
         if hold_tilt and model.actuator_x is not None and model.actuator_y is not None:
             places = np.array([model.actuator_x, model.actuator_y]) / model.aperture_radius
@@ -179,12 +185,6 @@ class CalibratedMirror:
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
-
-    def _reduce(self, sag: Floats, removed: Floats) -> Floats:
-        """Weighted sag (P,) or (P, N) with the span of `removed` (P, k, orthonormal) projected out."""
-        weighted = (sag.T * self._weights).T
-        result: Floats = weighted - removed @ (removed.T @ weighted)
-        return result
 
     def rows(self, shape: Shape, tilt: Floats | None = None) -> Floats:
         """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
@@ -202,7 +202,7 @@ class CalibratedMirror:
         kept = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
         if tilt is not None and self.tilt is not None:
             kept = TILT_WEIGHT * tilt
-        return np.concatenate([kept, weighted, self._reduce(shape.sag, self._terms)])
+        return np.concatenate([kept, weighted, reduced(shape.sag, self._weights, self._terms)])
 
     def solve(self, rows: Floats) -> Floats:
         """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
@@ -242,7 +242,7 @@ class CalibratedMirror:
         """
         model = self.model
         error = response(model, signals) - self.wanted(target)[0]
-        rms = float(np.linalg.norm(self._reduce(error.sag, self._tilt_free)))
+        rms = float(np.linalg.norm(reduced(error.sag, self._weights, self._terms[:, :PISTON_TILT])))
         lower, upper = rms_bounds(rms, model.held_out_rms)
         return Plan(
             signals=signals,

@@ -150,12 +150,11 @@ class Planner:
             aim, largest = effective, mirror.predict(target, effective).max_zernike
         if error is not None:
             largest = min(largest, error)
-        travel = 0.0
-        if state is not None:
-            travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         if state is None:
-            middle, known = mirror.limits.middle, False
+            middle, known, travel = mirror.limits.middle, False, 0.0
             state = rested(law, np.full(len(aim), middle), time, middle)
+        else:
+            travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
         signals, missed = aim, None

@@ -70,8 +70,6 @@ class Solver(ABC):
 
     #: Name in messages, tables and files.
     name: ClassVar[str]
-    #: Where the method comes from.
-    source: ClassVar[str]
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         """Prepare for a mirror.
@@ -84,13 +82,13 @@ class Solver(ABC):
         self.offset = model.offset
 
     def solve(self, wanted: Shape) -> Command:
-        """Signals for a surface, without measuring (open loop).
+        """Signals for a surface, without measuring (open loop): from rest, where the model's offset is the surface.
 
         Raises:
             ValueError: a shape of other size than the model's, or not finite.
         """
         self._check(wanted)
-        return self.limited(self._signals(self._start(), wanted - self.offset))
+        return self.limited(self._signals(np.zeros(self.model.influence_zernike.shape[1]), wanted - self.offset))
 
     def command(self, target: FocusTarget) -> Command:
         """Signals for `target`, without measuring. Raises TargetError when no such surface exists over the aperture."""
@@ -115,10 +113,6 @@ class Solver(ABC):
     @abstractmethod
     def _signals(self, start: Floats, change: Shape) -> Floats:
         """Signals (N,), inside the limits or not, that change the surface by `change` from where `start` holds it."""
-
-    def _start(self) -> Floats:
-        """Signals at which the model's offset is the surface."""
-        return np.zeros(self.model.influence_zernike.shape[1])
 
     def _check(self, shape: Shape) -> None:
         for name, value, size in (

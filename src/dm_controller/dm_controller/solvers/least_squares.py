@@ -8,7 +8,7 @@ from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_common.optics.zernike import PISTON_TILT
-from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel, reduced
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, normalised_terms, points_of
 
@@ -29,7 +29,6 @@ class PseudoInverse(Solver):
     """
 
     name = "pseudo_inverse"
-    source = "SVD pseudo-inverse of the influence matrix, reference 18 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)
@@ -50,7 +49,6 @@ class AZreg(PseudoInverse):
     """
 
     name = "AZreg"
-    source = "Eq. (6), least squares on the 21 coefficients"
 
 
 class IterativeLearning(PseudoInverse):
@@ -63,7 +61,6 @@ class IterativeLearning(PseudoInverse):
     """
 
     name = "iterative_learning"
-    source = "iterative learning control, references 12 and 13 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits, beta: float = BETA) -> None:
         if not (np.isfinite(beta) and beta > 0.0):
@@ -83,7 +80,6 @@ class AZWreg(Solver):
     """
 
     name = "AZWreg"
-    source = "Eqs. (7) and (8), region-weighted least squares on the sag points"
 
     def __init__(self, model: InfluenceModel, limits: Limits, region_weights: ArrayLike | None = None) -> None:
         """`region_weights`: (10,) Eq. (8), from the centre outwards; None = all equal."""
@@ -94,30 +90,24 @@ class AZWreg(Solver):
         plane = self._row[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y])
         self._plane = np.linalg.qr(plane)[0]
         influence = remove_piston_tilt(model.influence_sag.T, points).T
-        matrix = self._reduce(influence)
+        matrix = reduced(influence, self._row, self._plane)
         if not matrix.any():
             raise ValueError("influence_sag is zero: no actuator moves the surface; calibrate first")
         self._inverse = np.linalg.pinv(matrix, rcond=CUTOFF)
         self._correction = np.linalg.pinv(np.vstack([matrix, miss_rows(matrix)]))[:, : len(matrix)]
 
-    def _reduce(self, sag: Floats) -> Floats:
-        """Weighted sag (P,) or (P, N) without what a weighted plane explains."""
-        weighted = (sag.T * self._row).T
-        result: Floats = weighted - self._plane @ (self._plane.T @ weighted)
-        return result
-
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._inverse @ self._reduce(change.sag)
+        step: Floats = self._inverse @ reduced(change.sag, self._row, self._plane)
         return start + step
 
     def _corrected(self, signals: Floats, error: Shape) -> Floats:
         """With moves priced by what the actuators miss of them."""
-        better: Floats = signals - self._correction @ self._reduce(error.sag)
+        better: Floats = signals - self._correction @ reduced(error.sag, self._row, self._plane)
         return better
 
 
 class Bounded(Solver):
-    """Least squares inside the box: `CalibratedMirror` for shapes and corrections of any kind.
+    """Least squares inside the box ([9], chapter 23): `CalibratedMirror` for shapes and corrections of any kind.
 
     The coefficients beyond tilt weigh so much that they act as equalities, the sag beyond the 21 terms is as small as
     possible, and the limits hold by construction: nothing is ever clipped. Corrections also weigh what
@@ -125,7 +115,6 @@ class Bounded(Solver):
     """
 
     name = "bounded"
-    source = "bounded quadratic programme ([9], chapter 23)"
 
     def __init__(self, model: InfluenceModel, limits: Limits, mirror: CalibratedMirror | None = None) -> None:
         """`mirror`: of that model and those limits, which knows whether tilt is held and about which axis."""

@@ -51,14 +51,6 @@ class DegaussAction:
         if isinstance(refusal := self._gate.attempt("degauss", goal, judge), Refusal):
             raise refusal
 
-    def _begin(self, goal: Any) -> tuple[ActuatorWriter, Move] | Refusal:
-        """The move of a goal, which has begun; or its refusal: things may have changed since it was admitted."""
-
-        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> tuple[ActuatorWriter, Move]:
-            return writer, writer.submit(self._move(goal, configuration))
-
-        return self._gate.attempt("degauss", goal, carry_out)
-
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
         began, result = time.monotonic(), Degauss.Result()
         outcome, result.error_code, result.message = self._carry_out(handle)
@@ -71,7 +63,11 @@ class DegaussAction:
             return "canceled", ErrorCode.CANCELED, "cancelled before anything moved"
         if self._server.preempted(handle):
             return "abort", ErrorCode.PREEMPTED, "a newer goal took over before anything moved"
-        begun = self._begin(handle.request)
+
+        def begin(writer: ActuatorWriter, configuration: DriverConfiguration) -> tuple[ActuatorWriter, Move]:
+            return writer, writer.submit(self._move(handle.request, configuration))
+
+        begun = self._gate.attempt("degauss", handle.request, begin)  # things may have changed since it was admitted
         if isinstance(begun, Refusal):
             return "abort", begun.error_code, str(begun)
         writer, move = begun

@@ -4,7 +4,7 @@ A further drive unit is one subclass of :class:`~dm_driver.electronics.base.Driv
 `BACK_ENDS`; a serial one that takes whole frames needs neither, see :mod:`dm_driver.electronics.frame_format`.
 """
 
-from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
+from dm_driver.electronics.base import DriveElectronics
 from dm_driver.electronics.edac40 import Edac40Tcp, Edac40Udp
 from dm_driver.electronics.framed_serial import FramedSerial
 from dm_driver.electronics.microscope_mirror import MicroscopeMirror
@@ -17,14 +17,3 @@ BACK_ENDS: dict[str, type[DriveElectronics]] = {
     "framed_serial": FramedSerial,
     "microscope": MicroscopeMirror,
 }
-
-
-def make_electronics(kind: str, settings: ElectronicsSettings) -> DriveElectronics:
-    """Return the back end named `kind`, not yet opened.
-
-    Raises:
-        ValueError: no such back end, or a setting it needs is missing.
-    """
-    if kind not in BACK_ENDS:
-        raise ValueError(f"electronics.kind = {kind!r}: must be one of {', '.join(BACK_ENDS)}")
-    return BACK_ENDS[kind](settings)

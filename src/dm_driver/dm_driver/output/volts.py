@@ -84,11 +84,6 @@ class VoltScale:
         low, span = self._powers
         return np.asarray((low + (signals + 1.0) * (0.5 * span)) ** (1.0 / LAWS[self.law]), dtype=np.float64)
 
-    def signals(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Normalised signals of actuator volts."""
-        low, span = self._powers
-        return np.asarray((volts ** LAWS[self.law] - low) * (2.0 / span) - 1.0, dtype=np.float64)
-
     def codes(self, signals: NDArray[np.float64]) -> NDArray[np.uint16]:
         """Nearest codes of normalised signals; never one whose voltage lies outside volts_min..volts_max.
 
@@ -106,7 +101,8 @@ class VoltScale:
 
     def signals_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
         """Normalised signals that stand at the actuators for these codes."""
-        return self.signals(self.volts_of_codes(codes))
+        low, span = self._powers
+        return np.asarray((self.volts_of_codes(codes) ** LAWS[self.law] - low) * (2.0 / span) - 1.0, dtype=np.float64)
 
     def volts_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
         """Actuator volts for these codes."""

@@ -21,7 +21,6 @@ from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
-from dm_common.ros.lifecycle import STALE
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 from dm_tools.running_suite import NEEDED
@@ -144,7 +143,9 @@ class ConsoleNode:
         return Snapshot(
             **messages,
             diagnostics={
-                name: status if when >= recent else DiagnosticStatus(level=STALE, name=name, message="no longer heard")
+                name: status
+                if when >= recent
+                else DiagnosticStatus(level=DiagnosticStatus.STALE, name=name, message="no longer heard")
                 for name, (status, when) in diagnostics.items()
             },
             health=health,

@@ -31,12 +31,12 @@ def electronics_checks(driver: Mapping[str, Any]) -> Iterator[Check]:
 
 def opens(kind: str, driver: Mapping[str, Any]) -> Finding | None:
     """Whether the link opens, by the class of the driver's with which it does; no output changes."""
-    from dm_driver.electronics import ElectronicsSettings, make_electronics
-    from dm_driver.electronics.base import LinkError
+    from dm_driver.electronics import BACK_ENDS
+    from dm_driver.electronics.base import ElectronicsSettings, LinkError
 
     address, port, channels = (driver[name] for name in ("electronics.address", "electronics.port", "mirror.actuators"))
     settings = ElectronicsSettings(address, port, channels=channels)
-    electronics = make_electronics(kind, settings)
+    electronics = BACK_ENDS[kind](settings)
     try:
         electronics.open()
         electronics.close()

@@ -23,15 +23,16 @@ def measure(
     json: JsonOption = None,
 ) -> None:
     """Take one map of the mirror as it stands, and say what it shows. Nothing moves."""
-    from dm_common.optics.zernike import PISTON_TILT, SPOKEN, curvature_of, rms_beyond_tilt
+    from dm_common.optics.zernike import DEFOCUS, PISTON_TILT, SPOKEN, curvature_of_defocus, rms_beyond_tilt
 
     if reference_sphere is not None and not 0.0 < abs(reference_sphere) < math.inf:
         raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
         answer = client.measure(label)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
+    radius = info.aperture_radius
     figures: dict[str, Any] = {
-        "curvature": curvature_of(coefficients, info.aperture_radius) if info.aperture_radius > 0 else None,
+        "curvature": curvature_of_defocus(coefficients[DEFOCUS], radius) if radius > 0 else None,
         "rms_beyond_tilt_nm": nanometres(rms_beyond_tilt(coefficients, answer.zernike.residual_rms)),
         "rms_nm": nanometres(info.rms),
         "pv_nm": nanometres(info.pv),
