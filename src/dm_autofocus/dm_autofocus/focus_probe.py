@@ -8,7 +8,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -44,9 +44,13 @@ def raw_image(message: Image | CompressedImage) -> Image:
     """The image itself, or what is in a compressed one. Raises ImageError when it cannot be decoded."""
     if isinstance(message, Image):
         return message
-    pixels, encoding = decompressed(bytes(message.data), message.format)
-    image = Image(header=message.header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
-    image.step, image.is_bigendian = pixels.nbytes // image.height, int(sys.byteorder == "big")
+    return image_message(message.header, *decompressed(bytes(message.data), message.format))
+
+
+def image_message(header: Any, pixels: NDArray, encoding: str, big_endian: bool = sys.byteorder == "big") -> Image:
+    """Pixels (H, W, ...) as an image."""
+    image = Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    image.step, image.is_bigendian = pixels.nbytes // image.height, int(big_endian)
     image.data = array("B", pixels.tobytes())
     return image
 
@@ -191,14 +195,11 @@ class FocusProbe:
         self._other_request = None
         self.counted = self.dropped = 0
         self._check = check
-        purpose = f"action {action}; cancel it to end it"
         try:
-            with ExitStack() as stack:
-                try:
-                    stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
-                except ServiceCallError as error:
-                    raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
+            with self._hold.held(asked, f"action {action}; cancel it to end it", 0.0, self._values["move_timeout"]):
                 yield
+        except ServiceCallError as error:  # of the hold: no action calls a service
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
         finally:
             self.target = math.nan
             self._other_request = None

@@ -2,8 +2,6 @@
 
 import copy
 import math
-import sys
-from array import array
 from typing import Any
 
 import numpy as np
@@ -13,6 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from dm_autofocus.autofocus_parameters import tolerance_of
+from dm_autofocus.focus_probe import image_message
 from dm_autofocus.focus_stack import FEWEST, ImageStack
 from dm_autofocus.images import PLANAR, exposure_fault, grey, pixels_of
 from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
@@ -99,15 +98,9 @@ class FocusStackAction(ProbeAction):
     def _publish_stack(self, last: Image, pixels: NDArray, depth: NDArray[np.float32]) -> None:
         """The images with the header of the last one, as depth_image_proc takes them."""
         self._info.publish(camera_info_for(last, self._probe.camera_info, self._values["optics.focal_length_px"]))
-        native = sys.byteorder == "big"
-        for publisher, values, encoding, big in (
-            (self._image, pixels, "mono8" if last.encoding in PLANAR else last.encoding, last.is_bigendian),
-            (self._depth, depth, "32FC1", native),
-        ):
-            message = Image(header=last.header, height=last.height, width=last.width, encoding=encoding)
-            message.data = array("B", values.tobytes())
-            message.is_bigendian, message.step = int(big), len(message.data) // last.height
-            publisher.publish(message)
+        encoding = "mono8" if last.encoding in PLANAR else last.encoding
+        self._image.publish(image_message(last.header, pixels, encoding, last.is_bigendian))
+        self._depth.publish(image_message(last.header, depth, "32FC1"))
 
 
 def camera_info_for(image: Image, known: CameraInfo | None, focal_length_px: float) -> CameraInfo:

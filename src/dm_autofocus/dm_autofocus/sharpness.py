@@ -84,7 +84,7 @@ def tenengrad(image: NDArray, pixel_budget: int = PIXEL_BUDGET) -> float:
     """Mean squared Sobel gradient over the squared mean of an image (H, W) of any number type; no unit, 0 if black."""
     above, here, below = _rows(image, pixel_budget)
     along_x, along_y = _sobel(above, here, below)
-    return _relative(_mean_square(along_x) + _mean_square(along_y), here)
+    return _relative(here, along_x, along_y)
 
 
 def local_tenengrad(image: NDArray, cell: int) -> NDArray[np.float32]:
@@ -108,7 +108,7 @@ def laplacian(image: NDArray, pixel_budget: int = PIXEL_BUDGET) -> float:
     """Mean squared Laplacian over the squared mean of an image (H, W) of any number type; no unit, 0 if black."""
     above, here, below = _rows(image, pixel_budget)
     value = above[:, 1:-1] + below[:, 1:-1] + here[:, :-2] + here[:, 2:] - 4 * here[:, 1:-1]
-    return _relative(_mean_square(value), here)
+    return _relative(here, value)
 
 
 METRICS: dict[str, Callable[[NDArray], float]] = {"tenengrad": tenengrad, "laplacian": laplacian}
@@ -134,10 +134,7 @@ def _sobel(above: NDArray, here: NDArray, below: NDArray) -> tuple[NDArray, NDAr
     return smooth[:, 2:] - smooth[:, :-2], step[:, :-2] + 2 * step[:, 1:-1] + step[:, 2:]
 
 
-def _mean_square(values: NDArray) -> float:
-    return float(np.vdot(values, values)) / values.size
-
-
-def _relative(value: float, image: NDArray) -> float:
+def _relative(image: NDArray, *parts: NDArray) -> float:
+    """Sum of the mean squares of `parts` over the squared mean of the image."""
     mean = float(image.mean(dtype=np.float64))
-    return value / mean**2 if mean != 0 else 0.0
+    return sum(float(np.vdot(part, part)) / part.size for part in parts) / mean**2 if mean != 0 else 0.0

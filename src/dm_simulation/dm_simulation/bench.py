@@ -13,7 +13,7 @@ from dm_common.values import parameter, real, switch, text
 from dm_simulation.camera import CameraConfig, SceneCamera
 from dm_simulation.electronics.drive_unit import DriveConfig, DriveUnit
 from dm_simulation.electronics.monitor import Monitor, MonitorConfig
-from dm_simulation.electronics.server import OFF, SEVERE, ElectronicsServer, PortsConfig
+from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx, prune
@@ -107,9 +107,7 @@ class VirtualBench:
             reference = config.files.folder.absolute() / "reference"
             reference.mkdir(exist_ok=True)
             deliver(self._map_file(self.interferometer.reference(), ".datx", 0), reference / "flat.datx", 0.0)
-        self.electronics = ElectronicsServer(
-            self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith(SEVERE), text)
-        )
+        self.electronics = ElectronicsServer(self.unit, config.ports, self._on_frame, on_event)
         try:
             self.trigger = None if config.trigger_port == OFF else TriggerServer(config.trigger_port, self.measure)
         except OSError:

@@ -19,14 +19,12 @@ from dm_simulation.mirror.membrane import MembraneConfig
 from dm_simulation.mirror.piezo import DRAWN, PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 
-_PLATE_ON_PIEZOS, _ELECTROSTATIC_MEMBRANE = PRINCIPLES = ("piezo", "membrane")
-
 PARAMETERS = (
     Parameter("seed", whole(1, 0, 2**31), "Fixes gains, initial figure and noise, and what else is drawn."),
     Parameter("mirror.name", text(FilesConfig.part_name), "Model of the mirror, as map files name it."),
     Parameter(
         "mirror.principle",
-        text(_PLATE_ON_PIEZOS, choices=PRINCIPLES),
+        text("piezo", choices=("piezo", "membrane")),
         "A plate on piezo stacks (plate.*, piezo.*), or a membrane that electrodes pull (membrane.*).",
     ),
     *parameters_of("plate.", PlateConfig),
@@ -75,7 +73,7 @@ def check_bench(values: Mapping[str, Any]) -> None:
 
 def bench_config(values: Mapping[str, Any]) -> BenchConfig:
     """The configuration for the values of all parameters of PARAMETERS."""
-    membrane = values["mirror.principle"] == _ELECTROSTATIC_MEMBRANE
+    membrane = values["mirror.principle"] == "membrane"
     return BenchConfig(
         seed=values["seed"],
         plate=from_values(PlateConfig, values, "plate."),

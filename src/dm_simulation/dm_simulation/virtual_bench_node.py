@@ -186,9 +186,8 @@ class VirtualBenchNode(Node):
         Ctrl-C reaches all processes of a launch at once; emulated hardware that left first would not be reached.
         """
         deadline = time.monotonic() + DRIVER_LEAVES_S
-        while ("pdm_driver", self.get_namespace()) in self.get_node_names_and_namespaces():
-            if time.monotonic() > deadline:
-                break
+        driver = ("pdm_driver", self.get_namespace())
+        while driver in self.get_node_names_and_namespaces() and time.monotonic() < deadline:
             time.sleep(0.02)
         self._stop.set()
         for thread in self._threads:

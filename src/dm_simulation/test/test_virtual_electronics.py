@@ -195,7 +195,7 @@ class ServedUnit:
         self.events: list[str] = []
         self.link = folder / "ttyDAC40"
         ports = PortsConfig(0, 0, 0, str(self.link))
-        self.server = ElectronicsServer(self.unit, ports, self.count, self.events.append)
+        self.server = ElectronicsServer(self.unit, ports, self.count, lambda severe, text: self.events.append(text))
 
     def count(self) -> None:
         self.updates += 1

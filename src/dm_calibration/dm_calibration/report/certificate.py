@@ -22,7 +22,7 @@ from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.law_shape import certain_limits
 from dm_common.limits import Limits
-from dm_common.optics.conic import conic_coefficients
+from dm_common.optics.conic import conic_coefficients, reachable_range
 from dm_common.optics.zernike import PISTON_TILT
 
 #: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
@@ -69,17 +69,9 @@ def curvatures(calibration: Calibration) -> tuple[float, float]:
         wanted = conic_coefficients(curvature, 0.0, radius)[PISTON_TILT:] - offset
         return bool(np.abs(terms @ programme.solve(wanted) - wanted).max() <= TOLERANCE)
 
-    def edge(near: float, far: float) -> float:
-        while abs(far - near) > STEP:
-            middle = 0.5 * (near + far)
-            near, far = (middle, far) if reached(middle) else (near, middle)
-        return near
-
-    # A mirror that is only pulled does not reach 0.
-    hollow = 4.0 / radius**2 * float(offset[0] + limits.middle * terms[0].sum())
-    start = next(filter(reached, (0.0, hollow)), np.nan)
+    middle = 4.0 / radius**2 * float(offset[0] + limits.middle * terms[0].sum())
     stroke = 4.0 / radius**2 * (limits.high - limits.low) * float(np.abs(terms[0]).sum())
-    return (edge(start, start - stroke), edge(start, start + stroke))
+    return reachable_range(reached, middle, stroke, STEP)
 
 
 def certificate(

@@ -1,5 +1,6 @@
 """Conic surfaces about the axis, Eq. (2) in [1], and their Zernike coefficients."""
 
+import math
 from collections.abc import Callable
 from functools import cache
 
@@ -113,3 +114,24 @@ def pitch_of_sphere(
             f"{radius_of_curvature:g} m"
         )
     return float(found), 0.5e-9 / abs(seen)
+
+
+def reachable_range(reached: Callable[[float], bool], middle: float, stroke: float, step: float) -> tuple[float, float]:
+    """Smallest and largest curvature (1/m) that a mirror reaches; (nan, nan) = neither 0 nor that in mid range.
+
+    Args:
+        reached: whether it reaches a curvature; by convexity there is one edge on either side of one that it does.
+        middle: curvature in mid range: a mirror that is only pulled does not reach 0.
+        stroke: what all actuators together change it by at most.
+        step: to which the ends are found.
+    """
+    start = next(filter(reached, (0.0, middle)), math.nan)
+
+    def edge(far: float) -> float:
+        near = start
+        while abs(far - near) > step:
+            between = 0.5 * (near + far)
+            near, far = (between, far) if reached(between) else (near, between)
+        return near
+
+    return edge(start - stroke), edge(start + stroke)

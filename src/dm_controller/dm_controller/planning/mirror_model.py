@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
+from dm_common.optics.conic import reachable_range
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
 
@@ -273,28 +274,16 @@ class CalibratedMirror:
         return self._range_cached(target.with_curvature(0.0), tolerance)
 
     def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
-        model, near = self.model, 0.0
-        if not self._reaches(target, tolerance):
-            # A mirror that is only pulled does not reach 0.
-            defocus = model.zernike_offset[3] + self.limits.middle * model.influence_zernike[3].sum()
-            near = curvature_of_defocus(float(defocus), model.aperture_radius)
-            if not self._reaches(target.with_curvature(near), tolerance):
-                return (float("nan"), float("nan"))
-        # Beyond this the stroke of all actuators together could not follow.
-        stroke = (self.limits.high - self.limits.low) * float(np.abs(model.influence_zernike[3]).sum())
-        far = curvature_of_defocus(stroke, model.aperture_radius)
-        return (self._bisect(target, near, near - far, tolerance), self._bisect(target, near, near + far, tolerance))
+        model = self.model
+        defocus = model.zernike_offset[3] + self.limits.middle * model.influence_zernike[3].sum()
+        middle = curvature_of_defocus(float(defocus), model.aperture_radius)
+        swing = (self.limits.high - self.limits.low) * np.abs(model.influence_zernike[3]).sum()
+        stroke = curvature_of_defocus(float(swing), model.aperture_radius)
 
-    def _reaches(self, target: FocusTarget, tolerance: float) -> bool:
-        try:
-            return self.command(target)[1] <= tolerance
-        except TargetError:  # a conic of this curvature ends before the edge of the aperture
-            return False
+        def reached(curvature: float) -> bool:
+            try:
+                return self.command(target.with_curvature(curvature))[1] <= tolerance
+            except TargetError:  # a conic of this curvature ends before the edge of the aperture
+                return False
 
-    def _bisect(self, target: FocusTarget, near: float, far: float, tolerance: float) -> float:
-        """The reachable curvature between `near`, which is, and `far` next to that: by convexity there is one edge."""
-        while abs(far - near) > 1e-5:
-            middle = 0.5 * (near + far)
-            reached = self._reaches(target.with_curvature(middle), tolerance)
-            near, far = (middle, far) if reached else (near, middle)
-        return near
+        return reachable_range(reached, middle, stroke, 1e-5)

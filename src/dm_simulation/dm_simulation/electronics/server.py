@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from dm_common.values import parameter, text, whole
 from dm_simulation.electronics import frames
@@ -20,14 +19,10 @@ from dm_simulation.electronics.framed_unit import FramedConfig
 from dm_simulation.electronics.frames import FrameError
 from dm_simulation.electronics.serial_terminal import SerialTerminal
 
-T = TypeVar("T")
-
 LOOPBACK = "127.0.0.1"
 #: Port value that leaves a service out; 0 lets the system choose one.
 OFF = -1
 PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
-#: How events begin that tell of something wrong: what is no frame, or could not be carried out.
-SEVERE = ("malformed", "failed")
 DISCOVERY_QUESTION = b"Discovery: Who is out there?"
 DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 
@@ -51,9 +46,11 @@ class ElectronicsServer:
 
     Args:
         on_update: called in the server's thread after every frame that was carried out.
-        on_event: called with a line of text when something worth a log line happens; a severe one begins with SEVERE.
+        on_event: called with (severe, text) when something worth a log line happens; severe is what is no frame, or
+            could not be carried out.
 
     Attributes:
+        run: runs a task in the server's thread, after every frame that had arrived; see `EventLoop.run`.
         endpoints: actual "tcp_port", "udp_port", "discovery_port" and "pty", as far as they are offered.
         malformed_count: what was received and is no frame; the reasons are events.
 
@@ -66,7 +63,7 @@ class ElectronicsServer:
         unit: DriveUnit,
         ports: PortsConfig,
         on_update: Callable[[], None],
-        on_event: Callable[[str], None] = lambda text: None,
+        on_event: Callable[[bool, str], None] = lambda severe, text: None,
     ) -> None:
         self._unit = unit
         self._ports = ports
@@ -79,55 +76,43 @@ class ElectronicsServer:
         self._client: socket.socket | None = None
         self._datagrams: list[socket.socket] = []
         self._stream = bytearray()
-        self._loop = EventLoop("electronics", lambda error: on_event(f"failed, {type(error).__name__}: {error}"))
+        self._loop = EventLoop("electronics", lambda error: on_event(True, f"failed, {type(error).__name__}: {error}"))
+        self.run = self._loop.run
         self._terminal = SerialTerminal(unit, ports.framed, self._loop, on_update, self._reject)
         try:
-            self._loop.run(self._plug)
+            self.run(self._plug)
         except BaseException:
             self.close()
             raise
-
-    def run(self, task: Callable[[], T]) -> T:
-        """Run `task` in the server's thread, after every frame that had arrived, and return its value.
-
-        Raises:
-            OSError: the server is closed.
-        """
-        return self._loop.run(task)
 
     def set_plugged(self, plugged: bool) -> None:
         """Pull the data cable out or put it back on the same ports. The outputs hold their values meanwhile."""
         if plugged != self.plugged:
             self.run(self._plug if plugged else self._unplug)
-            self._on_event("plugged in" if plugged else "unplugged: outputs hold")
+            self._on_event(False, "plugged in" if plugged else "unplugged: outputs hold")
 
     def close(self) -> None:
         """Stop serving; free ports and link."""
-        self._loop.run(self._unplug)
+        self.run(self._unplug)
         self._loop.close()
 
     def _plug(self) -> None:
+        ports = self._ports
         try:
-            self._open_all()
+            if ports.tcp_port != OFF:
+                self._listen(int(self.endpoints.get("tcp_port", ports.tcp_port)))
+            if ports.udp_port != OFF:
+                self._bind_udp("udp_port", ports.udp_port, self._on_datagram)
+            if ports.discovery_port != OFF:
+                self._bind_udp("discovery_port", ports.discovery_port, self._on_discovery)
+            if ports.pty_link:
+                link = Path(ports.pty_link).expanduser()
+                self._terminal.open(link)
+                self.endpoints["pty"] = str(link)
         except BaseException:
             self._unplug()
             raise
         self.plugged = True
-
-    def _open_all(self) -> None:
-        def wanted(name: str, configured: int) -> int:
-            return int(self.endpoints.get(name, configured))
-
-        if self._ports.tcp_port != OFF:
-            self._listen(wanted("tcp_port", self._ports.tcp_port))
-        if self._ports.udp_port != OFF:
-            self._bind_udp("udp_port", wanted("udp_port", self._ports.udp_port), self._on_datagram)
-        if self._ports.discovery_port != OFF:
-            self._bind_udp("discovery_port", wanted("discovery_port", self._ports.discovery_port), self._on_discovery)
-        if self._ports.pty_link:
-            link = Path(self._ports.pty_link).expanduser()
-            self._terminal.open(link)
-            self.endpoints["pty"] = str(link)
 
     def _unplug(self) -> None:
         self.plugged = False
@@ -143,7 +128,7 @@ class ElectronicsServer:
     def _reject(self, source: str, reason: str, data: bytes = b"") -> None:
         self.malformed_count += 1
         shown = f" ({data[:16].hex(' ')}{' ...' if len(data) > 16 else ''})" if data else ""
-        self._on_event(f"malformed frame, {source}: {reason}{shown}")
+        self._on_event(True, f"malformed frame, {source}: {reason}{shown}")
 
     def _take_edac40(self, frame: bytes) -> None:
         self._unit.take_edac40(frames.decode_edac40(frame))
@@ -178,7 +163,7 @@ class ElectronicsServer:
         self._stream.clear()
         self._loop.watch(client, self._on_stream)
         self._listen(int(self.endpoints["tcp_port"]))
-        self._on_event("TCP client connected")
+        self._on_event(False, "TCP client connected")
 
     def _drop_client(self, reason: str) -> None:
         if self._client is None:
@@ -189,7 +174,7 @@ class ElectronicsServer:
         if self._stream:
             self._reject("TCP", "connection ended inside a frame", bytes(self._stream))
             self._stream.clear()
-        self._on_event(f"TCP client gone: {reason}")
+        self._on_event(False, f"TCP client gone: {reason}")
 
     def _on_stream(self) -> None:
         assert self._client is not None and self._listener is not None
@@ -226,7 +211,7 @@ class ElectronicsServer:
         endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         endpoint.setblocking(False)
         self._datagrams.append(endpoint)
-        _bind(endpoint, port, f"electronics.{name}")
+        _bind(endpoint, int(self.endpoints.get(name, port)), f"electronics.{name}")
         self.endpoints[name] = endpoint.getsockname()[1]
         self._loop.watch(endpoint, lambda: handler(endpoint))
 

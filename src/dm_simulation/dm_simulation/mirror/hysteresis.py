@@ -28,16 +28,6 @@ class HysteresisLaw(Protocol):
         """Go monotonically from the last signals to `u` (N,) and return m (N,)."""
 
 
-class NoHysteresis:
-    """A linear actuator."""
-
-    def __init__(self, count: int) -> None:
-        self._zero = np.zeros(count)
-
-    def move(self, u: Array) -> Array:
-        return self._zero
-
-
 def prandtl_ishlinskii_density(v: Array, r: Array) -> Array:
     """Relays whose number falls exponentially with the half-width, wherever their centre: loops are symmetric."""
     return np.exp(-r / 0.25) + 0.0 * v
@@ -116,7 +106,7 @@ class JilesAthertonHysteresis:
 
 
 class MixedHysteresis:
-    """A weighted sum of two laws."""
+    """A weighted sum of laws; of none, a linear actuator's 0."""
 
     def __init__(self, parts: tuple[tuple[Array | float, HysteresisLaw], ...]) -> None:
         self._parts = parts
@@ -163,7 +153,7 @@ def _mixed(count: int, _rng: np.random.Generator) -> HysteresisLaw:
 #: Laws by name. Those that begin with `drawn` are drawn at random, for each actuator its own; the others are all
 #: actuators'.
 LAWS: dict[str, Callable[[int, np.random.Generator], HysteresisLaw]] = {
-    "none": lambda count, rng: NoHysteresis(count),
+    "none": lambda count, rng: MixedHysteresis(()),
     "prandtl_ishlinskii": lambda count, rng: PreisachOperator(count, prandtl_ishlinskii_density),
     "preisach": lambda count, rng: PreisachOperator(count, skew_density),
     "bouc_wen": lambda count, rng: BoucWenHysteresis(count, 1.0, 2.2, 2.2, 1.0),
