@@ -20,7 +20,8 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.recalibration.drift import UpdateOptions
+from dm_calibration.recalibration.updates import RecalibrationManager
 from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.recipes import NO_RECIPES

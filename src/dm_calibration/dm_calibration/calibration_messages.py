@@ -79,10 +79,10 @@ def put_updates(
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
     """
-    fit, drift = kept.changed_fit(temperature), kept.drift
+    fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    warm_error = kept.warm_error(temperature)
+    warm_error = kept.filter.warm_error(drift, temperature)
     for promise in (message, message.hysteresis):  # no bound is below what maps have shown since one last agreed
         promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), warm_error)
     message.revision = drift.revision

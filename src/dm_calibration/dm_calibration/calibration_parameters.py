@@ -8,8 +8,7 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.plan import PlanOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
-from dm_calibration.recalibration.drift import DriftRates
-from dm_calibration.recalibration.updates import UpdateOptions
+from dm_calibration.recalibration.drift import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of
 from dm_common.values import from_values, real, switch, text, whole
@@ -80,7 +79,6 @@ PARAMETERS = (
         "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
     ),
     *parameters_of("updates.", UpdateOptions),
-    *parameters_of("updates.", DriftRates),
     live("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Drift of a gain from which to warn."),
     live("updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Drift of the figure from which to warn."),
     live(
@@ -129,5 +127,4 @@ def update_options(values: Mapping[str, Any]) -> UpdateOptions:
         aperture_tolerance=values["aperture_tolerance"],
         # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
-        rates=from_values(DriftRates, values, "updates."),
     )

@@ -24,7 +24,6 @@ from std_msgs.msg import Header
 from dm_calibration.acquisition import interferometer_messages as messages
 from dm_calibration.acquisition.acquisition import Acquisition, measured_ns
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings, too_large
-from dm_calibration.acquisition.reference_surface import corrections
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_calibration.interferometer_parameters import PARAMETERS, configure
 from dm_calibration.map_files import MapFileError, SurfaceMap
@@ -102,8 +101,7 @@ class InterferometerNode(ManagedNode):
     def activate(self) -> None:
         assert self._acquisition is not None
         self._acquisition.start()
-        settings = self._settings()
-        less = corrections(settings.reference, settings.retrace, settings.distortion)
+        less = self._settings().corrections
         self.get_logger().info(f"active; maps from {self._acquisition.source}{less and f', less {less}'}")
 
     def deactivate(self) -> None:
@@ -148,11 +146,9 @@ class InterferometerNode(ManagedNode):
             raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first")
         timeout_s = request.timeout or self._values["measure_timeout"]
         with self._counting_refusals():
-            acquired = acquisition.acquire(timeout_s)
-        taken = acquired.taken_ns
-        header = self._header(self._file_time(acquired.surface, believe_header=False) if taken is None else taken)
-        what = f"measured {request.label}".strip()
-        return self._accept(response, acquired.surface, acquired.measurement, header, what)
+            surface, measured = acquisition.acquire(timeout_s)
+        header = self._header(measured.stamp_ns or self._file_time(surface, believe_header=False))
+        return self._accept(response, surface, measured, header, f"measured {request.label}".strip())
 
     def _on_new_file(self, path: Path) -> None:
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""

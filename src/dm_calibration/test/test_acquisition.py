@@ -62,9 +62,9 @@ def test_command_that_is_told_its_output(tmp_path: Path, bench: Any) -> None:
     code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
     one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
     before = time.time_ns()
-    acquired = one.acquisition.acquire(20)
-    assert Path(acquired.surface.file).parent == tmp_path
-    assert before < acquired.taken_ns < time.time_ns()
+    surface, measured = one.acquisition.acquire(20)
+    assert Path(surface.file).parent == tmp_path
+    assert before < measured.stamp_ns < time.time_ns()
     (tmp_path / "marker.dat").write_bytes(MAP)
     wait_until(lambda: one.files, what="the marker, which stands still later than the triggered file")
     assert one.files == [tmp_path / "marker.dat"]
@@ -78,7 +78,7 @@ def test_output_that_grows_after_the_command_has_ended(tmp_path: Path, bench: An
     )
     code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-S', '-c', {child!r}, *sys.argv[1:]])"
     one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
-    assert one.acquisition.acquire(20).surface.sag.shape == (40, 40)
+    assert one.acquisition.acquire(20)[0].sag.shape == (40, 40)
 
 
 def test_no_shell_ever_sees_the_arguments(tmp_path: Path) -> None:
@@ -134,9 +134,9 @@ def test_command_whose_file_is_found_in_the_folder(tmp_path: Path, bench: Any) -
     (tmp_path / "source").write_bytes(MAP)
     code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
     one = bench(tmp_path, python(code, str(tmp_path / "source"), str(tmp_path / "from_instrument.dat")))
-    acquired = one.acquisition.acquire(20)
-    assert acquired.surface.file == str(tmp_path / "from_instrument.dat")
-    assert acquired.taken_ns is not None
+    surface, measured = one.acquisition.acquire(20)
+    assert surface.file == str(tmp_path / "from_instrument.dat")
+    assert measured.stamp_ns
     assert one.files == []
 
 
@@ -158,8 +158,9 @@ def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, 
     time.sleep(0.05)
     (tmp_path / "by_hand.dat").write_bytes(MAP)
     thread.join(20)
-    assert results[0].surface.file == str(tmp_path / "by_hand.dat")
-    assert results[0].taken_ns is None
+    surface, measured = results[0]
+    assert surface.file == str(tmp_path / "by_hand.dat")
+    assert not measured.stamp_ns, "nobody knows it"
     (tmp_path / "next.dat").write_bytes(MAP)
     wait_until(lambda: one.files, what="the next file")
     assert one.files == [tmp_path / "next.dat"]
@@ -187,7 +188,7 @@ def test_a_file_from_before_the_request_is_not_its_measurement_however_late_it_i
     wait_until(lambda: len(one.files) == 2 or results, what="the file from before")
     (tmp_path / "after.dat").write_bytes(MAP)
     thread.join(20)
-    assert results[0].surface.file == str(tmp_path / "after.dat")
+    assert results[0][0].file == str(tmp_path / "after.dat")
     assert one.files == [tmp_path / "first.dat", tmp_path / "before.dat"]
 
 

@@ -19,9 +19,9 @@ from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.displaced import described
-from dm_calibration.recalibration.drift import Displaced, Drift, DriftRates
+from dm_calibration.recalibration.drift import Displaced, Drift, UpdateOptions
 from dm_calibration.recalibration.map_listener import MapListener
-from dm_calibration.recalibration.updates import InUse, RecalibrationManager, UpdateOptions, Verdict
+from dm_calibration.recalibration.updates import InUse, RecalibrationManager, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import HASH, read_image, write_image
 from dm_common.atomic_write import StoreError
@@ -71,7 +71,8 @@ def known(manager: RecalibrationManager) -> Drift:
 
 
 def changed_fit(manager: RecalibrationManager, temperature: float = np.nan) -> InfluenceFit:
-    return in_use(manager).changed_fit(temperature)
+    kept = in_use(manager)
+    return kept.filter.changed(kept.drift, temperature)
 
 
 def error(bench: SteadyMirror, fit: InfluenceFit) -> float:
@@ -304,9 +305,10 @@ def test_what_the_temperature_does_is_foretold(
     without, not_known, with_temperature = np.sqrt(np.mean(np.square(errors), axis=0))
     assert with_temperature < 0.3 * without
     # Where it stops coming the bound says what it may do; where it comes, no bound is wider.
-    bound = in_use(updates).warm_error(np.nan)
+    kept = in_use(updates)
+    bound = kept.filter.warm_error(kept.drift, np.nan)
     assert 0.3 * not_known < bound < 10.0 * not_known
-    assert in_use(updates).warm_error(20.0) == 0.0
+    assert kept.filter.warm_error(kept.drift, 20.0) == 0.0
     message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
     put_updates(message, in_use(updates), np.nan, [], False)
     assert message.held_out_max_zernike > bound
@@ -523,7 +525,7 @@ def test_an_update_that_cannot_be_stored_changes_nothing(bench: SteadyMirror, ma
 def test_a_rate_of_zero_keeps_the_gains(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
     widths = []
     for gain in (0.0, 1e-3):
-        updates = begun(made, tmp_path / str(gain), replace(EXACT, rates=DriftRates(gain=gain, figure=0.0)))
+        updates = begun(made, tmp_path / str(gain), replace(EXACT, gain_rate=gain, figure_rate=0.0))
         updates.take(bench.measure("later", days=100.0), bench.settled())
         widths.append(np.diag(known(updates).covariance)[: bench.mirror.actuators].max())
     assert widths[0] < 0.1 * widths[1]

@@ -98,10 +98,10 @@ def test_the_first_measurement_after_the_request_counts() -> None:
     thread.start()
     sensor.offer(lambda: pytest.fail("nobody waits"), 200)
     threading.Timer(0.05, waiting.set).start()
-    acquired = sensor.acquire(5.0)
+    _, measured = sensor.acquire(5.0)
     thread.join()
-    assert acquired.taken_ns == 150
-    assert acquired.measurement.coefficients[3] == pytest.approx(150e-9)
+    assert measured.stamp_ns == 150
+    assert measured.coefficients[3] == pytest.approx(150e-9)
 
 
 def test_waiting_ends_in_time_and_when_it_is_stopped() -> None:

@@ -19,7 +19,8 @@ from dm_calibration.procedure.outcome import Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.recalibration.drift import UpdateOptions
+from dm_calibration.recalibration.updates import RecalibrationManager
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common import Floats
 from dm_common.messages import hysteresis_model_from

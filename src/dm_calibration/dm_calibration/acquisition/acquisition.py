@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
@@ -62,21 +62,6 @@ class AcquisitionSettings:
             )
 
 
-@dataclass(frozen=True)
-class Acquired:
-    """A measurement that was asked for.
-
-    Attributes:
-        surface, measurement: the oriented map and what was found in it.
-        taken_ns: the middle of the trigger command's run, on the clock given to Acquisition; None when the file came
-            without a trigger.
-    """
-
-    surface: SurfaceMap
-    measurement: Measurement
-    taken_ns: int | None
-
-
 class Acquisition:
     """Watches the folder in a thread, and takes measurements on request.
 
@@ -95,11 +80,12 @@ class Acquisition:
 
         Args:
             read: reads a map file, raising MapFileError for files that are not (yet) whole.
-            now_ns: clock for the times in Acquired.
+            now_ns: clock for the times of measurements.
             on_file: called in the watching thread with each new file.
             on_trouble: called there with a sentence, once each: a file refused unread, or the folder unreadable.
         """
         self.settings = settings
+        self.source = str(settings.folder or "files named to ingest_file only")
         self.folder_trouble = ""
         self._complain_at: float | None = None
         self._read = read
@@ -113,11 +99,6 @@ class Acquisition:
         self._waiting: queue.SimpleQueue[Path] | None = None
         self._before: set[Signature] = set()
         self._numbers = count(1)
-
-    @property
-    def source(self) -> str:
-        """Where maps come from."""
-        return str(self.settings.folder or "files named to ingest_file only")
 
     def start(self) -> None:
         """Begin to watch; what is in the folder now is not new."""
@@ -136,8 +117,12 @@ class Acquisition:
             self._thread.join(5)
             self._thread = None
 
-    def acquire(self, timeout_s: float) -> Acquired:
+    def acquire(self, timeout_s: float) -> tuple[SurfaceMap, Measurement]:
         """Trigger a measurement, or wait for the next new file when there is no trigger command.
+
+        Returns:
+            The oriented map, and what was found in it, of the middle of the trigger command's run; its time is not
+            known when the file came without a trigger.
 
         Raises:
             TriggerError: the trigger command failed.
@@ -155,10 +140,12 @@ class Acquisition:
         if any(PLACEHOLDER in argument for argument in self.settings.trigger_command):
             output = self._new_name(watch)
             taken = self._trigger(output, trigger_s)
-            return Acquired(*self._expected_file(output, deadline), taken)
-        with self._arrivals(watch) as arrivals:
-            triggered = self._trigger(None, trigger_s) if self.settings.trigger_command else None
-            return Acquired(*self._next_file(watch, arrivals, deadline), triggered)
+            surface, measured = self._expected_file(output, deadline)
+        else:
+            with self._arrivals(watch) as arrivals:
+                taken = self._trigger(None, trigger_s) if self.settings.trigger_command else 0
+                surface, measured = self._next_file(watch, arrivals, deadline)
+        return surface, replace(measured, stamp_ns=taken)
 
     def _trigger(self, output: Path | None, timeout_s: float) -> int:
         """Run the trigger command; returns the middle of its run, ns."""

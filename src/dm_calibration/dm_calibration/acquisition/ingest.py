@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.acquisition.reference_surface import absolute_sag, corrections
+from dm_calibration.acquisition.reference_surface import absolute_sag
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
 from dm_calibration.optics.aperture import (
     Aperture,
@@ -104,6 +104,18 @@ class IngestSettings:
         switch(False), "Subtract piston and tilt from the published map; coefficients and samples keep them."
     )
 
+    @property
+    def corrections(self) -> str:
+        """What is kept with maps of the errors of the instrument that were taken off them; "" = none were."""
+        parts = []
+        if self.reference is not None:
+            parts.append(f"{Path(self.reference.file).name}, SHA-256 {self.reference.sha256}")
+        if self.retrace:
+            parts.append(f"retrace error of {max(map(abs, self.retrace)) * 1e3:.4g} nm per um of tilt")
+        if self.distortion:
+            parts.append(f"distortion of {self.distortion:.4%}")
+        return "; ".join(parts)
+
 
 def too_large(radius: float, mirror_radius: float) -> str:
     """That a configured aperture does not fit on the mirror, as a sentence; radii in m, of the mirror 0 = not known."""
@@ -199,7 +211,7 @@ class Ingest:
             radius=aperture.radius_px * (pitch or 0.0),
             wavelength=source.wavelength,
             system_error_subtracted=-1 if subtracted is None else int(subtracted),
-            reference_surface=corrections(settings.reference, settings.retrace, settings.distortion),
+            reference_surface=settings.corrections,
             instrument_error=settings.instrument_error,
             scale_error=settings.scale_error,
             file=source.file,

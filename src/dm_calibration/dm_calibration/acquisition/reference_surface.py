@@ -1,6 +1,5 @@
 """The instrument's own error: a map of it, which is subtracted from every other. What is left is absolute."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
@@ -28,16 +27,6 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
             f"{wavelength * 1e9:.3f} nm as the instrument's (wavelength.expected)"
         )
     return reference
-
-
-def corrections(reference: SurfaceMap | None, retrace: Sequence[float] = (), distortion: float = 0.0) -> str:
-    """What is kept with maps of the errors of the instrument that were taken off them; "" = none were."""
-    parts = [f"{Path(reference.file).name}, SHA-256 {reference.sha256}"] if reference is not None else []
-    if retrace:
-        parts.append(f"retrace error of {max(map(abs, retrace)) * 1e3:.4g} nm per um of tilt")
-    if distortion:
-        parts.append(f"distortion of {distortion:.4%}")
-    return "; ".join(parts)
 
 
 def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float) -> Floats:
@@ -68,5 +57,4 @@ def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavele
         )
     if different:
         raise MapRejectedError(different)
-    difference: Floats = source.sag - reference.sag
-    return difference
+    return source.sag - reference.sag

@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.acquisition.acquisition import Acquired
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import SurfaceMap
 from dm_common.errors import ErrorCode, Refusal
@@ -83,8 +82,8 @@ class SensorAcquisition:
                 self._seen = seen, stamp_ns
                 self._changed.notify_all()
 
-    def acquire(self, timeout_s: float) -> Acquired:
-        """The next measurement.
+    def acquire(self, timeout_s: float) -> tuple[SurfaceMap, Measurement]:
+        """The next measurement, with its time.
 
         Raises:
             MapRejectedError and what else `read` raises: it is no good.
@@ -109,4 +108,5 @@ class SensorAcquisition:
                 f"nothing with a later stamp than the request came on {self.source} within {timeout_s:g} s; is the "
                 "sensor running, and does its clock agree with this one?",
             )
-        return Acquired(*self._read(found[0]()), found[1])
+        surface, measured = self._read(found[0]())
+        return surface, replace(measured, stamp_ns=found[1])

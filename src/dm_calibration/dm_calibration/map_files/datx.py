@@ -6,7 +6,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.map_files.datx_structure import (
     SIGNATURE,
@@ -19,6 +18,7 @@ from dm_calibration.map_files.datx_structure import (
 )
 from dm_calibration.map_files.four_d import is_four_d, parse_four_d
 from dm_calibration.map_files.surface_map import (
+    SQUARE_TOLERANCE,
     MapFileError,
     SurfaceMap,
     check_factor,
@@ -30,6 +30,9 @@ from dm_calibration.map_files.surface_map import (
 #: Units of length a surface may be stored in, as m. "Fringes" is scaled by the optical factors instead.
 _LENGTHS = {"nanometers": 1e-9, "micrometers": 1e-6, "millimeters": 1e-3, "meters": 1.0, "angstroms": 1e-10}
 
+#: What a setting that was on or off is stored as.
+_TRUTH = {"0": False, "false": False, "off": False, "1": True, "true": True, "on": True}
+
 #: "No Data" lies far beyond any height; Mx stores the largest double.
 _NO_DATA_LEAST = 1e30
 
@@ -38,9 +41,6 @@ _LINKS_MAX = 10_000
 
 #: Two witnesses of one value may differ by this much (one is sometimes stored in single precision).
 _AGREEMENT = 1e-6
-
-#: Pitches along x and y may differ by this much before pixels count as not square.
-_SQUARE_TOLERANCE = 0.01
 
 
 def is_datx(start: bytes) -> bool:
@@ -93,7 +93,7 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
         instrument=software or "Mx",
         serial=_extra_text(extra, "System Serial Number"),
         time_stamp=time_stamp if time_stamp else None,
-        system_error_subtracted=_truth(extra.get("Subtract System Error")),
+        system_error_subtracted=_TRUTH.get(_extra_text(extra, "Subtract System Error").lower()),
     )
 
 
@@ -126,7 +126,7 @@ def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
 
 
 def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> dict[str, Any]:
-    """What /Attributes/<id> tells, by the last part of each name without the ending ':Value'."""
+    """Single values that /Attributes/<id> tells, by the last part of each name without the ending ':Value'."""
     try:
         node = object_at(file, _path(metadata, "Attributes"))
     except MapFileError:  # older files do not list it in /MetaData
@@ -136,29 +136,21 @@ def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> 
             node = None
     if node is None:
         return {}
+    told = ((name, np.asarray(value).ravel()) for name, value in node.attrs.items())
     return {
-        name.removesuffix(":Value").rpartition(".")[2]: np.asarray(value).ravel()
-        for name, value in node.attrs.items()
-        if not name.endswith((":Unit", ":Converter"))
+        name.removesuffix(":Value").rpartition(".")[2]: value[0]
+        for name, value in told
+        if value.size == 1 and not name.endswith((":Unit", ":Converter"))
     }
 
 
 def _extra_number(extra: dict[str, Any], name: str) -> float | None:
     value = extra.get(name)
-    return float(value[0]) if value is not None and value.size == 1 and value.dtype.kind in "fiu" else None
+    return float(value) if isinstance(value, np.integer | np.floating) else None
 
 
 def _extra_text(extra: dict[str, Any], name: str) -> str:
-    value = extra.get(name)
-    return as_text(value[0]).strip() if value is not None and value.size == 1 else ""
-
-
-def _truth(value: NDArray[Any] | None) -> bool | None:
-    """Yes or no from 0/1, a boolean or a word; None when it is neither."""
-    if value is None or value.size != 1:
-        return None
-    word = as_text(value[0]).strip().lower()
-    return {"0": False, "false": False, "off": False, "1": True, "true": True, "on": True}.get(word)
+    return as_text(extra.get(name, "")).strip()
 
 
 def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> float:
@@ -180,13 +172,13 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
 def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
     converters = [_converter(surface, name) for name in ("X Converter", "Y Converter")]
     x, y = (None if parameters is None else check_pitch(parameters[1]) for parameters in converters)
-    if x is not None and y is not None and abs(x - y) > _SQUARE_TOLERANCE * x:
+    if x is not None and y is not None and abs(x - y) > SQUARE_TOLERANCE * x:
         raise MapFileError(f"{surface.name}: pixels of {x:g} m x {y:g} m: must be square")
     stated = check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
     pitch = x if x is not None else y
     if pitch is None:
         return stated
-    if stated is not None and abs(pitch - stated) > _SQUARE_TOLERANCE * pitch:
+    if stated is not None and abs(pitch - stated) > SQUARE_TOLERANCE * pitch:
         raise MapFileError(
             f"{surface.name}: X Converter: {pitch:g} m per pixel, Lateral Resolution {stated:g} m: must agree"
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from dm_calibration.map_files.surface_map import (
     METRES,
+    SQUARE_TOLERANCE,
     MapFileError,
     SurfaceMap,
     check_heights,
@@ -23,8 +24,6 @@ _TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 #: How programs write the units of `METRES`, beside these themselves and their plurals.
 _SPOKEN = {"meter": "m", "metre": "m", "millimeter": "mm", "micron": "um", "micrometer": "um", "nanometer": "nm"}
 _KEYWORD = re.compile("[A-Z0-9_-]*")
-#: Pitches along x and y may differ by this much before pixels count as not square.
-_SQUARE_TOLERANCE = 0.01
 
 Header = Mapping[str, Any]
 
@@ -161,7 +160,7 @@ def _pitch(header: Header) -> float | None:
         abs(_real(header, f"CDELT{axis}", 0.0)) * _unit(str(header.get(f"CUNIT{axis}", "")), f"CUNIT{axis}")
         for axis in (1, 2)
     )
-    if abs(x - y) > _SQUARE_TOLERANCE * x:
+    if abs(x - y) > SQUARE_TOLERANCE * x:
         raise MapFileError(f"CDELT1, CDELT2: pixels of {x:g} m x {y:g} m: must be square")
     return check_pitch(x)
 

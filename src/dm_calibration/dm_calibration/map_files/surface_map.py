@@ -31,6 +31,9 @@ METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 #: Largest height of a map, m: far beyond the range of any interferometer.
 HEIGHT_MAX = 10.0
 
+#: Pitches along x and y may differ by this much before pixels count as not square.
+SQUARE_TOLERANCE = 0.01
+
 #: Pixels of one instrument agree so well from map to map, relatively; files keep the pitch in single precision.
 PITCH_TOLERANCE = 1e-4
 

@@ -52,8 +52,7 @@ class Aperture:
         """(height, width): True for pixels whose centre lies inside or on the circle."""
         x = np.arange(shape[1]) - self.centre_x_px
         y = np.arange(shape[0]) - self.centre_y_px
-        inside: NDArray[np.bool_] = x**2 <= self.radius_px**2 - y[:, None] ** 2
-        return inside
+        return x**2 <= self.radius_px**2 - y[:, None] ** 2
 
     def places(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.complex128]:
         """x + iy of pixels, y up, in units of the radius."""
@@ -99,8 +98,10 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
     if len(x) >= _FEWEST_RIM_POINTS:
         circle, scatter = _fit_circle(x, y)
         far = circle.radius_px > math.hypot(*region.shape)  # a slanted edge, which is no rim
-        if not far and scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
-            return circle
+        if not far and scatter <= _ROUND * circle.radius_px:
+            disc = circle.disc(region.shape)
+            if np.count_nonzero(disc & region) >= 0.8 * np.count_nonzero(disc | region):
+                return circle
     circle = _inscribed_circle(region)
     if region[[0, -1]].any() or region[:, [0, -1]].any():  # cut off there, as a rectangular field is
         return circle
@@ -155,13 +156,6 @@ def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Apertur
     distance = np.abs(np.hypot(dx - solution[0], dy - solution[1]) - solution[2])
     circle = Aperture(float(centre[0] + solution[0]), float(centre[1] + solution[1]), float(abs(solution[2])))
     return circle, float(np.median(distance))
-
-
-def _is_disc(region: NDArray[np.bool_], circle: Aperture) -> bool:
-    """Whether region and circle cover about the same pixels."""
-    disc = circle.disc(region.shape)
-    union = np.count_nonzero(disc | region)
-    return bool(np.count_nonzero(disc & region) >= 0.8 * union)
 
 
 def _inscribed_circle(region: NDArray[np.bool_]) -> Aperture:

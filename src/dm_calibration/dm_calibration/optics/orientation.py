@@ -41,7 +41,13 @@ class Orientation:
         quarters = round(self.rotate_deg / 90.0)
         sag = np.rot90(sag, quarters % 4)
         rest = self.rotate_deg - 90.0 * quarters
-        return np.ascontiguousarray(sag if abs(rest) < _EXACT else _rotated(sag, rest))
+        if abs(rest) >= _EXACT:
+            from scipy import ndimage  # here: most benches need no rotation
+
+            # Linear between pixels: one has data where its four neighbours had. What the interpolation changes is the
+            # curvature over one pixel: less than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
+            sag = ndimage.rotate(sag, rest, order=1, cval=np.nan)
+        return np.ascontiguousarray(sag, dtype=np.float64)
 
     def after(self, turn: float, mirrored: bool) -> Orientation:
         """The orientation for a mirror that the maps, as this one has them, show mirrored left to right (or not) and
@@ -54,14 +60,3 @@ class Orientation:
         if flip_y:  # the same as the other flip and half a turn
             flip_x, flip_y, rotate = not flip_x, False, rotate + 180.0
         return Orientation(flip_x, flip_y, (rotate + 180.0) % 360.0 - 180.0)
-
-
-def _rotated(sag: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """The map turned counter-clockwise, between pixels linearly.
-
-    A pixel has data where its four neighbours had. What the interpolation changes is the curvature over one pixel: less
-    than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
-    """
-    from scipy import ndimage  # here: most benches need no rotation
-
-    return np.asarray(ndimage.rotate(sag, degrees, order=1, cval=np.nan), dtype=np.float64)

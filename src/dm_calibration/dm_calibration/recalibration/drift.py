@@ -4,43 +4,47 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, cho_solve
+from scipy.linalg import cho_solve
 from scipy.special import ndtri
 
 from dm_common import Floats
-from dm_common.values import parameter, real
+from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.values import live_parameter, parameter, real, whole
+
+#: For one K, known beforehand of a mirror that no map has shown warmer, standard deviations: relative change of all
+#: gains, and change of the figure, m rms.
+WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 
 
 @dataclass(frozen=True)
-class DriftRates:
-    """How fast a mirror is expected to change: standard deviations. Half of the variance of gains is common.
+class UpdateOptions:
+    """Which maps are taken, and how far they may change the calibration.
 
     Attributes:
-        warm_gain, warm_figure: for one K, known beforehand of a mirror that no map has shown warmer; figure in m rms.
+        gain_rate, figure_rate: standard deviations. Half of the variance of gains is common.
+        valid_fraction_min: least share of valid pixels.
+        aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
+        signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
     """
 
-    gain: float = parameter(
+    surprise_max: float = live_parameter(
+        real(3.0, 1.0, 100.0),
+        "A map that differs from its prediction by more than this times the expected difference is not taken.",
+    )
+    surprises_max: int = live_parameter(
+        whole(3, 1, 1000), "Maps in a row that differ so much after which the mirror counts as changed."
+    )
+    gain_rate: float = parameter(
         real(3e-4, 0.0, 1.0),
         "Expected relative drift of a gain in one day; it grows with the root of time. 0 = the gains stay.",
-        name="gain_rate",
     )
-    figure: float = parameter(
+    figure_rate: float = parameter(
         real(1e-9, 0.0, 1e-6, "m"),
         "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
-        name="figure_rate",
     )
-    warm_gain: float = 1e-3
-    warm_figure: float = 2e-9
-
-    def growth(self, actuators: int, values: int) -> Floats:
-        """(N + 3 R + 1, N + 3 R + 1) that one day adds to the covariance of a drift."""
-        figure = self.figure**2 / values * np.eye(values)
-        gains = 0.5 * self.gain**2 * (np.eye(actuators) + 1.0)
-        return np.asarray(block_diag(gains, figure, np.zeros((1 + 2 * values,) * 2)))
-
-    def warm(self, values: int) -> Floats:
-        """(1 + R,) variances of what one K does."""
-        return np.array([self.warm_gain**2, *np.full(values, self.warm_figure**2 / values)])
+    valid_fraction_min: float = 0.5
+    aperture_tolerance: float = APERTURE_TOLERANCE
+    signal_sigma: float = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
@@ -31,7 +31,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, displacement, visible_gain, without_response
-from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, surprise_of
+from dm_calibration.recalibration.drift import WARM_FIGURE, WARM_GAIN, Comparison, Drift, UpdateOptions, surprise_of
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import slow_creep
 from dm_common.hysteresis.model import HysteresisModel
@@ -56,9 +56,7 @@ class _Innovation(NamedTuple):
     """A map against its prediction, in R reduced values.
 
     Attributes:
-        prior: (N + 3 R + 1, N + 3 R + 1) covariance of gains, figure, what temperature does and creep, at its time.
-        crept: (R,) m rms, what creep did by then as the maps before predict it.
-        design: (R, N + 3 R + 1) what it shows of them.
+        design: (R, N + 3 R + 1) what it shows of gains, figure, what temperature does and creep.
         predicted, warm, shown: (R,) change that the maps before predict, that they predict of the temperature, and
             that it shows, m rms.
         expected: (R, R) covariance of their difference.
@@ -66,8 +64,6 @@ class _Innovation(NamedTuple):
         zernike_error, sag_error: (K,) and (P,) m, from the calibration as it is used.
     """
 
-    prior: Floats
-    crept: Floats
     design: Floats
     predicted: Floats
     warm: Floats
@@ -83,30 +79,32 @@ class DriftFilter:
 
     Args:
         calibration: its maps show how far a map scatters about its prediction.
-        signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
-        rates: how fast a mirror drifts; `options` holds both.
+        options: how fast a mirror drifts, and how far actuators stand off without a hysteresis model.
 
     Raises:
         ValueError: the maps of a hysteresis model have time stamps that run backwards.
     """
 
-    def __init__(self, calibration: Calibration, signal_sigma: float, rates: DriftRates) -> None:
+    def __init__(self, calibration: Calibration, options: UpdateOptions) -> None:
         fit, maps, hysteresis = calibration.fit, calibration.maps, calibration.hysteresis
-        self._fit, self.options = fit, (signal_sigma, rates)
+        self._fit, self.options = fit, options
         self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
         self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
         self._visible = visible_gain(self._gain, self.reduction, calibration)
         self._silent = without_response(calibration)
         self._offset = self.reduction.reduce(fit.zernike_offset, fit.sag_offset)
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
-        if hysteresis is not None:
-            signal_sigma = self._law_sigma(hysteresis)
+        signal_sigma = options.signal_sigma if hysteresis is None else self._law_sigma(hysteresis)
         self._creep_law = HysteresisModel.linear() if hysteresis is None else hysteresis.law
         # What effective signals that err by 1 each, whichever way, make of the values.
         self._unit = self._gain @ self._gain.T
         self._law = signal_sigma**2 * self._unit
         self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
-        self._rates, self._growth = rates, rates.growth(fit.actuators, self.reduction.size)
+        # (N + 3 R + 1, N + 3 R + 1) that one day adds to the covariance of a drift.
+        values = self.reduction.size
+        gains = 0.5 * options.gain_rate**2 * (np.eye(fit.actuators) + 1.0)
+        figure = options.figure_rate**2 / values * np.eye(values)
+        self._growth = np.asarray(block_diag(gains, figure, np.zeros((1 + 2 * values,) * 2)))
         known = np.isfinite(maps.temperature) & fit.used
         self._temperature = float(maps.temperature[known].mean()) if known.any() else np.nan
 
@@ -117,7 +115,7 @@ class DriftFilter:
         share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
         gain = np.square(np.minimum(share, GAIN_SIGMA_MAX))
         offset = (self._noise + np.diag(self._law)) / max(int(fit.used.sum()), 1) + fit.drift_rms**2 / values
-        warm = self._rates.warm(values)
+        warm = np.array([WARM_GAIN**2, *np.full(values, WARM_FIGURE**2 / values)])
         return Drift(
             gain=np.zeros(fit.actuators),
             offset=np.zeros(values),
@@ -139,9 +137,9 @@ class DriftFilter:
             repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
                 does not average out, so repeats count for less and less.
         """
-        stamp_ns = measured.stamp_ns
+        drift = self._at(drift, measured.stamp_ns)
         seen = self._innovation(drift, measured, effective, repeat)
-        prior, design, factor = seen.prior, seen.design, seen.factor
+        prior, design, factor = drift.covariance, seen.design, seen.factor
         innovation = seen.shown - seen.predicted - seen.warm
         shared = prior @ design.T
         ends = np.cumsum((self._fit.actuators, self.reduction.size, 1 + self.reduction.size))
@@ -164,11 +162,11 @@ class DriftFilter:
             gain=drift.gain + gain,
             offset=drift.offset + offset,
             thermal=drift.thermal + thermal,
-            crept=seen.crept + crept,
+            crept=drift.crept + crept,
             covariance=0.5 * (covariance + covariance.T),
-            stamp_ns=max(stamp_ns, drift.stamp_ns),
+            stamp_ns=max(measured.stamp_ns, drift.stamp_ns),
             revision=drift.revision + 1,
-            checked_ns=stamp_ns,
+            checked_ns=measured.stamp_ns,
             surprising=0,
             disagreement=0.0,
             evidence=evidence,
@@ -195,7 +193,7 @@ class DriftFilter:
         Raises:
             MapNotUsableError: one stands where it should, as far as the map shows.
         """
-        seen = self._innovation(drift, measured, effective, repeat)
+        seen = self._innovation(self._at(drift, measured.stamp_ns), measured, effective, repeat)
         away, sigma = displacement(seen.shown - seen.predicted - seen.warm, self._gain, seen.factor, actuators)
         at = drift.reached(effective)
         stuck = drift.stuck.copy()
@@ -221,8 +219,8 @@ class DriftFilter:
         return replace(drift, crept=kept * drift.crept, covariance=covariance)
 
     def _innovation(self, drift: Drift, measured: Measurement, effective: Floats, repeat: int) -> _Innovation:
-        drift, temperature = self._at(drift, measured.stamp_ns), measured.temperature
-        prior = drift.covariance
+        """`drift`: at the time of the map."""
+        temperature = measured.temperature
         moved = self._gain * np.where(np.isnan(drift.stuck), effective, 0.0)
         figure, warmer = np.eye(self.reduction.size), drift.warmer(temperature)
         warmed = warmer * np.column_stack((moved.sum(axis=1), figure))
@@ -236,19 +234,21 @@ class DriftFilter:
         shown = self.reduction.reduce(zernike_error, sag_error) + used
         # What the calibration itself does not know of its influence function, beyond gains.
         leverage = effective @ self._fit.signal_covariance @ effective
-        expected = design @ prior @ design.T + (1.0 + leverage) * np.diag(self._noise) + (1.0 + repeat) ** 2 * self._law
+        expected = design @ drift.covariance @ design.T + (1.0 + repeat) ** 2 * self._law
+        expected += (1.0 + leverage) * np.diag(self._noise)
         if np.isnan(temperature):  # what it has been seen to do may have happened
             unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
             expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
-        return _Innovation(
-            prior, drift.crept, design, predicted, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
-        )
+        factor = cho_factor(expected)
+        return _Innovation(design, predicted, warm, shown, expected, factor, zernike_error, sag_error)
 
-    def warm_error(self, drift: Drift) -> float:
-        """95 % bound of the largest coefficient error where the temperature is not known, m; 0 = it makes no change.
+    def warm_error(self, drift: Drift, temperature: float) -> float:
+        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known, or changes none.
 
-        It is taken to be within the range of those of the maps.
+        One that is not known is taken to be within the range of those of the maps.
         """
+        if np.isfinite(temperature):
+            return 0.0
         coefficients = np.abs(self.reduction.expand(drift.thermal[1:])[0])
         coefficients += np.abs(drift.thermal[0]) * np.abs(self._fit.influence_zernike).sum(axis=1)
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())

@@ -126,7 +126,7 @@ class MapListener:
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
         kept = self._updates.in_use
-        if error := kept.warm_error(self._temperatures.now()) if kept else 0.0:
+        if kept is not None and (error := kept.filter.warm_error(kept.drift, self._temperatures.now())):
             doubts.append(f"The topic temperature does not come: up to {1e9 * error:.1f} nm are not corrected.")
         return doubts
 

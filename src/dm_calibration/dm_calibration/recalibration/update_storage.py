@@ -15,7 +15,9 @@ from dm_common.atomic_write import write_whole
 SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1
 
+#: Arrays of finite numbers, and those in which NaN has a meaning.
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
+_OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
 _FIGURES = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0, "disagreement": 0.0}
@@ -26,33 +28,34 @@ class UpdatesFileError(ValueError):
     """A file of updates is damaged, foreign, or of another calibration; the message says which."""
 
 
-def basis_hash(calibration: Calibration) -> str:
-    """SHA-256 over what updates change: influence function, points, hysteresis. Recipes, notes may be added later."""
+def _head(calibration: Calibration) -> dict[str, Attribute]:
+    """What ties a file to its calibration: id, and SHA-256 over what updates change, influence function, points,
+    hysteresis. Recipes, notes may be added later.
+    """
     columns: dict[str, Column] = {name: getattr(calibration.fit, name) for name in _RESULT}
     columns |= {f"points/{name}": getattr(calibration.fit.points, name) for name in ("x", "y", "weight")}
-    return content_hash(columns | hysteresis_columns(calibration.hysteresis), {"id": calibration.id})
+    basis = content_hash(columns | hysteresis_columns(calibration.hysteresis), {"id": calibration.id})
+    tied = {"calibration": calibration.id, "basis_sha256": basis}
+    return {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **tied}
 
 
-def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> None:
-    """Write `updates` of the calibration `identifier` with the hash `basis`.
+def write_updates(path: Path, calibration: Calibration, updates: Drift) -> None:
+    """Write `updates` of `calibration`.
 
     Raises:
         OSError: what stood there before still does.
     """
-    columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, "stuck", "temperatures")}
+    columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, *_OR_NAN)}
     attributes: dict[str, Attribute] = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "calibration": identifier,
-        "basis_sha256": basis,
+        **_head(calibration),
         **{name: getattr(updates, name) for name in _NUMBERS},
         **dict(zip(_FIGURES, (*updates.evidence.ravel().tolist(), updates.disagreement), strict=True)),
     }
     write_whole(path, write_image(columns, attributes))
 
 
-def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift | None:
-    """The updates in a file; None when there is no file.
+def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | None:
+    """The updates of `calibration` in a file; None when there is no file.
 
     Args:
         like: with arrays of the shapes that must be there.
@@ -66,10 +69,9 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         columns, attributes = read_image(path)
     except ImageError as error:
         raise UpdatesFileError(f"{path.name}: {error}") from error
-    wanted = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "calibration": identifier, "basis_sha256": basis}
-    for name, value in wanted.items():
-        if attributes.get(name) != value:
-            raise UpdatesFileError(f"{path.name}: {name} is {attributes.get(name)!r}: must be {value!r}")
+    for name, wanted in _head(calibration).items():
+        if attributes.get(name) != wanted:
+            raise UpdatesFileError(f"{path.name}: {name} is {attributes.get(name)!r}: must be {wanted!r}")
     numbers = {name: attributes.get(name) for name in _NUMBERS}
     for name, number in numbers.items():
         if not isinstance(number, int) or number < 0:
@@ -80,16 +82,14 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
     if later and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
         size = len(like.covariance) - sum(map(len, later.values()))
         arrays |= later | {"covariance": block_diag(covariance, like.covariance[size:, size:])}
-    for name, value in arrays.items():
-        shape = getattr(like, name).shape
-        if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
-            raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
     # Before these were kept all actuators moved, and nothing was known of the temperature.
-    for name, meaning in (("stuck", "an actuator moves"), ("temperatures", "it is not known")):
-        arrays[name] = value = columns.get(name, getattr(like, name))
-        shape = getattr(like, name).shape
-        if not isinstance(value, np.ndarray) or value.shape != shape or np.isinf(value).any():
-            raise UpdatesFileError(f"{path.name}: {name} must be {shape} numbers, NaN where {meaning}")
+    arrays |= {name: columns.get(name, getattr(like, name)) for name in _OR_NAN}
+    for name, value in arrays.items():
+        shape, nan = getattr(like, name).shape, name in _OR_NAN
+        allowed = f"numbers, NaN where {_OR_NAN[name]}" if nan else "finite numbers"
+        right = isinstance(value, np.ndarray) and value.shape == shape and np.isfinite(value) | (nan & np.isnan(value))
+        if not np.all(right):
+            raise UpdatesFileError(f"{path.name}: {name} must be {shape} {allowed}")
     figures = {name: attributes.get(name, before) for name, before in _FIGURES.items()}
     for name, number in figures.items():
         if not isinstance(number, float) or not np.isfinite(number):

@@ -3,59 +3,32 @@
 The calibration's own file is never touched. What later maps have shown stands beside it, in ``<id>.updates.hdf5``.
 """
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described, without_response, worst_elsewhere
-from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates
+from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
-from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
+from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
-from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.values import live_parameter, real, whole
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
 #: Moves that are nearer to each other in time are one, s.
 SAME_MOVE_S = 0.2
 SUFFIX = ".updates.hdf5"
-
-
-@dataclass(frozen=True)
-class UpdateOptions:
-    """What is taken, and how far it may change the calibration.
-
-    Attributes:
-        valid_fraction_min: least share of valid pixels.
-        aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
-        signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
-    """
-
-    surprise_max: float = live_parameter(
-        real(3.0, 1.0, 100.0),
-        "A map that differs from its prediction by more than this times the expected difference is not taken.",
-    )
-    surprises_max: int = live_parameter(
-        whole(3, 1, 1000), "Maps in a row that differ so much after which the mirror counts as changed."
-    )
-    valid_fraction_min: float = 0.5
-    aperture_tolerance: float = APERTURE_TOLERANCE
-    signal_sigma: float = 0.05
-    rates: DriftRates = field(default_factory=DriftRates)
 
 
 @dataclass(frozen=True)
@@ -77,26 +50,16 @@ class InUse:
     """The calibration in use and what later maps have shown of it. Never changed in place.
 
     Attributes:
-        basis: hash of what updates change, see :func:`basis_hash`.
         repeats: maps that were taken of the present shape, which the mirror has had since `since` (s), the first of
             them at `first_ns`.
     """
 
     calibration: Calibration
     filter: DriftFilter
-    basis: str
     drift: Drift
     repeats: int = 0
     since: float = float("nan")
     first_ns: int = 0
-
-    def changed_fit(self, temperature: float = math.nan) -> InfluenceFit:
-        """The influence function as maps have found it, at `temperature` (degC)."""
-        return self.filter.changed(self.drift, temperature)
-
-    def warm_error(self, temperature: float) -> float:
-        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known."""
-        return 0.0 if math.isfinite(temperature) else self.filter.warm_error(self.drift)
 
 
 class RecalibrationManager:
@@ -143,14 +106,13 @@ class RecalibrationManager:
             self.in_use = None
             if calibration is None:
                 return ""
-            options, basis = self._options(), basis_hash(calibration)
-            drift_filter = DriftFilter(calibration, options.signal_sigma, options.rates)
+            drift_filter = DriftFilter(calibration, self._options())
             drift, remark = drift_filter.start(calibration.stamp_ns), ""
             try:
-                drift = read_updates(self._file(calibration.id), calibration.id, basis, drift) or drift
+                drift = read_updates(self._file(calibration.id), calibration, drift) or drift
             except UpdatesFileError as error:
                 remark = f"updates of {calibration.id} are ignored: {error}"
-            self.in_use = InUse(calibration, drift_filter, basis, drift)
+            self.in_use = InUse(calibration, drift_filter, drift)
             return remark
 
     def take(
@@ -183,7 +145,6 @@ class RecalibrationManager:
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
             found = comparison.displaced, updates.reached(settled.effective)
-            worst = max(comparison.max_zernike, worst_elsewhere(*found, calibration.fit.influence_zernike))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
                 reason += described(*found, np.isfinite(updates.stuck), without_response(calibration))
@@ -196,10 +157,11 @@ class RecalibrationManager:
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
             else:
-                worst = max(kept.drift.disagreement, worst)
+                elsewhere = worst_elsewhere(*found, calibration.fit.influence_zernike)
+                worst = max(kept.drift.disagreement, comparison.max_zernike, elsewhere)
                 changed = replace(kept.drift, surprising=kept.drift.surprising + 1, disagreement=worst)
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
-                write_updates(self._file(calibration.id), calibration.id, kept.basis, changed)
+                write_updates(self._file(calibration.id), calibration, changed)
             self.in_use = replace(kept, drift=changed)
             with suppress(OSError):  # the update itself is stored
                 shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
@@ -219,15 +181,13 @@ class RecalibrationManager:
             kept = self._kept()
             with storing(f"updates of {kept.calibration.id} were not removed"):
                 self._file(kept.calibration.id).unlink(missing_ok=True)
-            fresh = kept.filter.start(kept.calibration.stamp_ns)
-            self.in_use = InUse(kept.calibration, kept.filter, kept.basis, fresh)
+            self.in_use = InUse(kept.calibration, kept.filter, kept.filter.start(kept.calibration.stamp_ns))
 
     def _kept(self) -> InUse:
         if (kept := self.in_use) is None:
             raise MapNotUsableError("no calibration is in use")
-        options = self._options()
-        if kept.filter.options != (made_with := (options.signal_sigma, options.rates)):  # parameters that are live
-            kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, *made_with))
+        if kept.filter.options != (options := self._options()):  # parameters that are live
+            kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, options))
         return kept
 
     def _file(self, identifier: str, suffix: str = SUFFIX) -> Path:

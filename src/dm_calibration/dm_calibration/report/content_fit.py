@@ -1,17 +1,49 @@
 """Text of the report, part two: influence functions, actuators, residuals, regions, coefficients."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.hysteresis_fit import effective_maps
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_NAMES
+from dm_calibration.influence.regression import make_design
 from dm_calibration.report import figures
+from dm_calibration.report.content import NM
 from dm_calibration.report.document import Picture, Section, Table
-from dm_calibration.report.residuals import Residuals
+from dm_common import Floats
 from dm_common.geometry import rings
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, regional_rms
 from dm_common.optics.zernike import NAMES, PISTON_TILT
 
-NM = 1e9
+
+def residuals(calibration: Calibration) -> MapSet:
+    """The maps that entered the fit, with what it leaves of their sag (0 where a map has no data) and coefficients, m.
+
+    Measured less influence function times signals less the figure as it drifted, piston and tilt removed; `applied` are
+    effective signals where the calibration holds a hysteresis model. The figure is found again from the residuals: with
+    the influence function given, its values at the reference frames are the same least-squares problem as in the fit.
+
+    Raises:
+        TooFewMapsError, ValueError: maps that no fit can be made of; those of a stored calibration can.
+    """
+    fit, maps = calibration.fit, calibration.maps
+    if calibration.hysteresis is not None:
+        maps = effective_maps(maps, calibration.hysteresis.law)
+    used = maps.select(fit.used)
+    design = make_design(used)
+    drift = design.matrix[:, : design.drift]
+
+    def less_drift(values: Floats) -> Floats:
+        return np.asarray(values - drift @ np.linalg.lstsq(drift, values, rcond=None)[0])
+
+    predicted = used.applied @ fit.influence_sag.T + fit.sag_offset
+    sag = fill_gaps(remove_piston_tilt(used.sag, used.points), predicted, used.points) - predicted
+    sag = np.where(np.isfinite(used.sag), sag, 0.0)
+    coefficients = used.coefficients - used.applied @ fit.influence_zernike.T - fit.zernike_offset
+    return replace(used, sag=less_drift(sag), coefficients=less_drift(coefficients))
 
 
 def influence(calibration: Calibration) -> Section:
@@ -52,15 +84,15 @@ def residual(calibration: Calibration) -> Section:
     return Section("Residuals of the maps", [text], pictures=[picture])
 
 
-def regions(calibration: Calibration, left: Residuals) -> Section:
+def regions(calibration: Calibration, left: MapSet) -> Section:
     """Residual by region."""
     title = "Regions"
     try:
-        regional = regional_rms(left.sag, left.maps.points, labels=left.maps.label)
+        regional = regional_rms(left.sag, left.points, labels=left.label)
     except EmptyRegionError as error:
         return Section(title, [f"Not evaluated: {error}."])
-    moved = ~left.maps.reference
-    shown, kinds = regional[moved], [kind for kind, each in zip(left.maps.kind, moved, strict=True) if each]
+    moved = ~left.reference
+    shown, kinds = regional[moved], [kind for kind, each in zip(left.kind, moved, strict=True) if each]
     weights = calibration.region_weights
     header = ["area, %", "median, nm", "90th percentile, nm", "largest, nm"] + (["weight"] if weights.size else [])
     rows = []
@@ -81,15 +113,15 @@ def regions(calibration: Calibration, left: Residuals) -> Section:
     return Section(title, [text], [Table("Residual by region", header, rows)], [picture])
 
 
-def coefficients(calibration: Calibration, left: Residuals) -> Section:
+def coefficients(calibration: Calibration, left: MapSet) -> Section:
     """Residual by Zernike term."""
     hysteresis = calibration.hysteresis
     sigma = hysteresis.zernike_sigma if hysteresis is not None else None
-    rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0)) * NM
+    rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0))
     header = ["term", "in-sample rms, nm"] + (["held-out moves, nm"] if sigma is not None else [])
     rows = [
-        [NAMES[k], f"{rms[k]:.3f}"] + ([f"{sigma[k] * NM:.3f}"] if sigma is not None else [])
-        for k in range(PISTON_TILT, left.maps.terms)
+        [NAMES[k], f"{rms[k] * NM:.3f}"] + ([f"{sigma[k] * NM:.3f}"] if sigma is not None else [])
+        for k in range(PISTON_TILT, left.terms)
     ]
     text = "What the fit leaves of each coefficient beyond tilt, rms over the maps. "
     if sigma is not None:
@@ -100,5 +132,5 @@ def coefficients(calibration: Calibration, left: Residuals) -> Section:
     else:
         bound = calibration.fit.held_out_max_zernike * NM
         text += f"Held out, with what hysteresis may add, the largest stays below {bound:.2f} nm in 95 % of the maps."
-    picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(left, sigma))
+    picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(rms, sigma))
     return Section("Zernike coefficients", [text], [Table("Residual by coefficient", header, rows)], [picture])

@@ -13,7 +13,6 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import KINDS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
 from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, YELLOW
-from dm_calibration.report.residuals import Residuals
 from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
@@ -158,15 +157,14 @@ def regions_figure(regional: Floats, labels: Sequence[str]) -> Figure:
     return figure
 
 
-def coefficients_figure(left: Residuals, hysteresis_sigma: Floats | None) -> Figure:
-    """rms residual of each Zernike coefficient beyond tilt; beside it what held-out moves showed, when known."""
+def coefficients_figure(rms: Floats, hysteresis_sigma: Floats | None) -> Figure:
+    """`rms` residual (K,) of each Zernike coefficient, beyond tilt; beside it what held-out moves showed, if known."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     axes = figure.add_subplot()
     first = PISTON_TILT
-    place = np.arange(first, left.coefficients.shape[1])
-    rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0))[first:]
+    place = np.arange(first, len(rms))
     share = 0.8 if hysteresis_sigma is None else 0.4
-    axes.bar(place - (0.8 - share) / 2, rms * NM, share, color=BLUE, label="maps of the fit (in-sample)")
+    axes.bar(place - (0.8 - share) / 2, rms[first:] * NM, share, color=BLUE, label="maps of the fit (in-sample)")
     if hysteresis_sigma is not None:
         held_out = hysteresis_sigma[first:] * NM
         axes.bar(place + 0.2, held_out, share, color=ORANGE, label="held-out moves, noise of maps removed")

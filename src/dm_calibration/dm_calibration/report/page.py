@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,21 +11,14 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.recalibration.drift import UpdateOptions
+from dm_calibration.recalibration.updates import RecalibrationManager
 from dm_calibration.report import certificate, checks, content, content_fit, content_hysteresis
 from dm_calibration.report.content_hysteresis import loop_opening
 from dm_calibration.report.document import Section
 from dm_calibration.report.html_page import html_page
 from dm_calibration.report.pdf_pages import pdf_pages
-from dm_calibration.report.residuals import residuals
 from dm_common.atomic_write import write_whole
-
-
-class Written(NamedTuple):
-    """The files of a report."""
-
-    html: Path
-    pdf: Path
 
 
 def sections(
@@ -36,7 +29,7 @@ def sections(
     Raises:
         OSError: `file` cannot be read.
     """
-    left, since = residuals(calibration), list[str]()
+    left, since = content_fit.residuals(calibration), list[str]()
     if file is not None:
         updates = RecalibrationManager(
             file.parent, lambda: UpdateOptions(surprises_max=values["updates.surprises_max"])
@@ -66,8 +59,8 @@ def sections(
 
 def write_report(
     calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
-) -> Written:
-    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`; each is there whole or not at all.
+) -> tuple[Path, Path]:
+    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each whole or not at all; returns the two files.
 
     Args:
         file: that the calibration was read from, for its SHA-256.
@@ -78,10 +71,10 @@ def write_report(
     """
     made = sections(calibration, file, values)
     title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
-    written = Written(folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf")
-    write_whole(written.html, html_page(title, made).encode())
-    write_whole(written.pdf, pdf_pages(title, made))
-    return written
+    page, pdf = folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf"
+    write_whole(page, html_page(title, made).encode())
+    write_whole(pdf, pdf_pages(title, made))
+    return page, pdf
 
 
 def figures_of(calibration: Calibration) -> dict[str, Any]:

@@ -65,10 +65,10 @@ class ReportWriter:
             self._waiting.discard(file)
             if self._ended:
                 return
+            values = json.dumps({name: self._values[name] for name in JUDGED_BY})
             try:
-                command = [sys.executable, "-m", "dm_calibration.report.report_writer", str(file)]
-                self._process = subprocess.Popen(
-                    [*command, json.dumps({name: self._values[name] for name in JUDGED_BY})],
+                self._process = process = subprocess.Popen(
+                    [sys.executable, "-m", "dm_calibration.report.report_writer", str(file), values],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
@@ -77,9 +77,6 @@ class ReportWriter:
             except OSError as error:
                 self._publish(f"no report of {file.name}: {error}", True)
                 return
-        self._finish(file, self._process)
-
-    def _finish(self, file: Path, process: subprocess.Popen[bytes]) -> None:
         try:
             errors = process.communicate(timeout=TIMEOUT_S)[1].decode(errors="replace").strip()
         except subprocess.TimeoutExpired:

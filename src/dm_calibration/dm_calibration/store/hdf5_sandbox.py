@@ -152,9 +152,5 @@ class Hdf5Sandbox:
         return f"reading it ended the helper process with status {status}"
 
 
-_sandbox = Hdf5Sandbox()
-
-
-def read_in_sandbox(task: str, content: bytes) -> Answer:
-    """:meth:`Hdf5Sandbox.read` of the one helper of this process."""
-    return _sandbox.read(task, content)
+#: Of the one helper of this process.
+read_in_sandbox = Hdf5Sandbox().read

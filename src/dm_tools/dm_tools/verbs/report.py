@@ -116,12 +116,12 @@ def report(
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
             names[name] = typer.prompt(f"{name}, for the first page (Enter = none)", default="", show_default=False)
     keep_people(names)
-    written = write_report(found, folder, file, values)
+    page, pdf = write_report(found, folder, file, values)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
         f"{len(found.limitations)} known limitations"
     )
-    console.print(f"page: {os.path.relpath(written.html)}\nPDF: {os.path.relpath(written.pdf)}")
-    files = {"html": str(written.html), "pdf": str(written.pdf)}
+    console.print(f"page: {os.path.relpath(page)}\nPDF: {os.path.relpath(pdf)}")
+    files = {"html": str(page), "pdf": str(pdf)}
     write_json(json, figures_of(found) | {"files": files, "seconds": time.monotonic() - started})
-    next_step(f"open {os.path.relpath(written.pdf)}")
+    next_step(f"open {os.path.relpath(pdf)}")
