@@ -542,3 +542,24 @@ def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_pat
     with pytest.raises(ValueError, match=r"/actuator_state: the node \w+ publishes it here.*ROS_DOMAIN_ID"):
         play(bag, ["/actuator_state"], domain=domain)
     assert len(seen) == 10
+
+
+def test_a_driver_that_starts_meanwhile_ends_a_replay(observer: Observer, domain: int, tmp_path: Path) -> None:
+    messages: list[tuple[str, Any]] = [("/actuator_state", ActuatorState(sequence=k)) for k in range(10)]
+    bag, seen = write_bag(tmp_path / "bag", messages), observer.record(ActuatorState, "actuator_state", qos.STATE)
+
+    def start_driver(_seconds: float) -> None:
+        observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        names = observer.node.count_publishers
+        wait_until(lambda: names("actuator_state") > 1, 60, "the driver")
+        time.sleep(1.0)  # until the player has found it too
+
+    with pytest.raises(ValueError, match="/actuator_state: the node"):
+        play(bag, ["/actuator_state"], domain=domain, progress=start_driver)
+    assert len(seen) < 10
+
+
+def test_a_rate_is_refused_before_the_recording_is_read(tmp_path: Path) -> None:
+    for rate in ("0", "-1", "nan"):
+        result = CliRunner().invoke(make_app(), ["replay", str(tmp_path), f"--rate={rate}"])
+        assert result.exit_code == 2 and "must be above 0" in result.output

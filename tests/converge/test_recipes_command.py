@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 import typer
 from dm_msgs.action import BuildRecipes
+from dm_msgs.msg import Recipe, RecipeBook
 from typer.testing import CliRunner
 
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import terms_of
 from dm_tools import cli
 from dm_tools.long_actions import recipe_step
-from dm_tools.verbs.recipes import curvatures_of
+from dm_tools.verbs.recipes import curvatures_of, next_of
 
 
 def test_a_list_or_a_range() -> None:
@@ -52,3 +53,16 @@ def test_terms_that_are_none_are_refused(text: str) -> None:
 def test_a_list_builds_nothing(words: tuple[str, ...]) -> None:
     refused = CliRunner().invoke(cli.app, ["recipes", "--list", *words])
     assert refused.exit_code == 2 and f"--list and {words[0]}: only one of them" in refused.output
+
+
+@pytest.mark.parametrize(
+    ("book", "advice"),
+    [
+        (RecipeBook(), "./dm calibrate"),
+        (RecipeBook(calibration_id="a"), "./dm recipes"),
+        (RecipeBook(calibration_id="a", degauss_steps=100), "./dm check"),
+        (RecipeBook(calibration_id="a", degauss_steps=100, recipes=[Recipe()]), "mode: conditioned"),
+    ],
+)
+def test_what_to_do_next_goes_by_what_there_is(book: RecipeBook, advice: str) -> None:
+    assert advice in next_of(book)

@@ -236,13 +236,20 @@ def test_a_later_set_signals_takes_over_from_one_that_waits(
 def test_degauss_makes_the_history_known(driver: Driver) -> None:
     goal = Degauss.Goal(steps=6, end_signals=[0.1] * 37)
     answer = driver.observer.run_goal(Degauss, "degauss", goal).result
-    assert answer.error_code == ErrorCode.OK and answer.duration > 0
+    assert answer.error_code == ErrorCode.OK and answer.duration > 0 and "history" not in answer.message
     state = driver.wait_for_state(lambda state: state.history_known and not state.moving, "history known")
     assert list(state.applied) == pytest.approx([0.1] * 37, abs=CODE)
     on_wire = signals_of(driver.unit.frames)
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
     bad = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(amplitude=1.5)).result
     assert bad.error_code == ErrorCode.OUT_OF_RANGE and "must be float, 0 to 1" in bad.message
+
+
+@pytest.mark.parametrize("goal", [Degauss.Goal(steps=4), Degauss.Goal(steps=6, amplitude=0.5)])
+def test_a_degauss_that_wipes_too_little_says_so(driver: Driver, goal: Degauss.Goal) -> None:
+    answer = driver.observer.run_goal(Degauss, "degauss", goal).result
+    assert answer.error_code == ErrorCode.OK
+    assert "the whole range and 5 of them or more to make the history known" in answer.message
 
 
 def test_a_degauss_has_feedback_and_a_bound_and_is_cancelled_to_the_shape_before(driver: Driver) -> None:

@@ -336,4 +336,5 @@ def test_without_a_calibration(start: Callable[..., NodeProcess], observer: Obse
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path)})
     for fields in ({}, {"forget": True}):
         answer = observer.call(UpdateCalibration, "update_calibration", UpdateCalibration.Request(**fields))
-        assert (answer.error_code, answer.message) == (ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+        assert answer.error_code == ErrorCode.NOT_CALIBRATED
+        assert answer.message == "no calibration is in use: `./dm calibrate` or load_calibration"

@@ -276,7 +276,7 @@ class MapListener:
 
     def _calibration(self) -> Calibration:
         if (kept := self._updates.in_use) is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: `./dm calibrate` or load_calibration")
         return kept.calibration
 
     def health(self) -> tuple[bytes, list[str], dict[str, object]]:

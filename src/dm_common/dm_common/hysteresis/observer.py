@@ -87,7 +87,8 @@ class HysteresisTracker:
         if not report.history_known:
             # Without a link, nobody knows whether the outputs held: the unit may have had no power.
             since = self._seen if report.linked and not last.linked else report.time
-            self._guess_keeping_creep(report, self.unknown or "writes were lost, or a degauss was left", since)
+            reason = "writes were lost, or a degauss was left or too small"
+            self._guess_keeping_creep(report, self.unknown or reason, since)
             return
         if (missed := report.turns - last.turns - 1) > 0:
             reason = f"{missed} turns were not seen" if missed > 1 else "a turn was not seen"

@@ -9,6 +9,7 @@ from dm_msgs.action import Degauss
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import DEGAUSS_STEPS_MIN
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
@@ -91,7 +92,9 @@ class DegaussAction:
                 )
         if ended is not Outcome.REACHED:
             return "abort", CODE_OF_OUTCOME[ended], ended.value
-        return "succeed", ErrorCode.OK, f"{move.steps} half-swings in {time.monotonic() - began:.1f} s"
+        too_little = f"; it takes the whole range and {DEGAUSS_STEPS_MIN} of them or more to make the history known"
+        swings = f"{move.steps} half-swings in {time.monotonic() - began:.1f} s"
+        return "succeed", ErrorCode.OK, swings if move.wipes else swings + too_little
 
     def _slew_back(self, writer: ActuatorWriter, move: Move, holder: str) -> str:
         """Leave a degauss for the shape that the mirror held before.

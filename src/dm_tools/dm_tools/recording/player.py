@@ -81,13 +81,8 @@ def play(
             for name in names
         }
         time.sleep(DISCOVERY_S)
-        for name in (name for name in names if name.rsplit("/", 1)[-1] == DRIVER_STATE):
-            living = {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}
-            if living:
-                raise ValueError(
-                    f"{name}: the node {living.pop()} publishes it here, and who follows that would take the recorded "
-                    "moves for its own; replay with another ROS_DOMAIN_ID, or --topics without it"
-                )
+        for name in names:
+            _check_no_driver(node, name)
         for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
             node.destroy_publisher(publishers.pop(topic.name))
             remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")
@@ -96,6 +91,7 @@ def play(
             first = message.log_time if first is None else first
             elapsed = 1e-9 * (message.log_time - first)
             time.sleep(max(0.0, begun + elapsed / rate - time.monotonic()))
+            _check_no_driver(node, message.topic.name)  # one may start meanwhile, or be found late on a busy machine
             publishers[message.topic.name].publish(message.data)
             counts[message.topic.name] += 1
             progress(elapsed)
@@ -105,6 +101,17 @@ def play(
     finally:
         node.destroy_node()
         context.try_shutdown()
+
+
+def _check_no_driver(node: Node, name: str) -> None:
+    """Raise ValueError where the topic is the state of a driver, and one publishes it."""
+    if name.rsplit("/", 1)[-1] != DRIVER_STATE:
+        return
+    if living := {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}:
+        raise ValueError(
+            f"{name}: the node {living.pop()} publishes it here, and who follows that would take the recorded moves "
+            "for its own; replay with another ROS_DOMAIN_ID, or --topics without it"
+        )
 
 
 def _has_changed(node: Node, topic: Topic) -> bool:

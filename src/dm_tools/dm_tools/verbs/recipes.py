@@ -62,6 +62,15 @@ def _figures(book: Any) -> dict[str, Any]:
     return figures(book, "degauss_steps", "interpolation_error_nm") | {"recipes": recipes}
 
 
+def next_of(book: Any) -> str:
+    """What to do next, given the recipes of the calibration in use, a dm_msgs/RecipeBook."""
+    if book.recipes:
+        return "requests with `mode: conditioned`, or with a time budget, use them (docs/recipes.md)"
+    if not book.calibration_id:
+        return "./dm calibrate"
+    return "./dm check: recipes are back once a map agrees" if book.degauss_steps else "./dm recipes builds some"
+
+
 def recipes(
     curvatures: Annotated[
         str,
@@ -114,8 +123,10 @@ def recipes(
             f"{shape_text(recipe)}, conic constant {recipe.conic_constant:g}: largest coefficient error "
             f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
         )
-    if not book.recipes:
+    if not book.calibration_id:
+        console.print("no calibration is in use")
+    elif not book.recipes:
         none = "withholds its recipes: maps disagree" if book.degauss_steps else "holds no recipes"
-        console.print(f"calibration {book.calibration_id or '(none)'} {none}")
+        console.print(f"calibration {book.calibration_id} {none}")
     write_json(json, {"calibration": book.calibration_id, **_figures(book)})
-    next_step("./dm focus CURVATURE: with a time budget the controller uses a recipe where it does better")
+    next_step(next_of(book))

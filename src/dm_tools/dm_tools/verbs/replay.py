@@ -34,6 +34,8 @@ def replay(
     from dm_tools.recording.bag import BagReader
     from dm_tools.recording.player import play, replayed
 
+    if not rate > 0.0:  # before the recording is read, which takes a minute where it was not finished
+        raise typer.BadParameter(f"--rate {rate:g}: must be above 0")
     bag = BagReader(recording)
     for name in bag.unfinished:
         console.print(f"[yellow]remark[/] {name} was not finished: what is whole in it is read")
