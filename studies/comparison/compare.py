@@ -22,7 +22,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
-from dm_calibration.influence.maps import SURFACE
+from dm_calibration.influence.maps import StepKind
 from dm_calibration.influence.region_weighting import choose_weighting
 from dm_calibration.influence.regression import make_design, regress
 from dm_calibration.procedure.procedure import Progress
@@ -199,7 +199,7 @@ def fitting_limits(bench: SimulatedBench, curvatures: Sequence[float]) -> Floats
 
 def poke_model(calibration: Calibration) -> InfluenceModel:
     """The influence function of the pokes and reference frames alone."""
-    maps = calibration.maps.select(np.array([kind != SURFACE for kind in calibration.maps.kind], dtype=bool))
+    maps = calibration.maps.select(np.array([kind != StepKind.SURFACE for kind in calibration.maps.kind], dtype=bool))
     return influence_model(fit_influence(maps, FitOptions()), calibration.aperture_radius)
 
 

@@ -14,7 +14,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.influence.maps import SURFACE, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
@@ -170,7 +170,7 @@ def measure_samples(
     bench = _MapKeepingBench(config) if every_pixel else SimulatedBench(config)
     calibration = bench.calibrate(progress=progress)
     maps, influence = calibration.maps, calibration.fit.influence_zernike
-    chosen = maps.select(np.array([kind == SURFACE for kind in maps.kind], dtype=bool))
+    chosen = maps.select(np.array([kind == StepKind.SURFACE for kind in maps.kind], dtype=bool))
     error = surface_control_error(chosen.sag, chosen.applied, influence, chosen.points)
     regional = regional_rms(error, chosen.points, labels=chosen.label)
     panel_a, panel_b = figure_5(regional, chosen.label)

@@ -23,7 +23,7 @@ from dm_calibration.procedure.event_frames import _EVENTS, Storing
 from dm_calibration.procedure.outcome import Event, MapTaken
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
-from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, open_run
+from dm_calibration.procedure.resumable_run import OpenRun, identity_of, open_run
 from dm_calibration.procedure.run_journal import EVENTS, read_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -46,7 +46,7 @@ class PowerCut(Exception):
 def opened(folder: Path, plan: Plan, fresh: bool = False, age_max: float = 3600.0, **settings: object) -> OpenRun:
     identity = identity_of(plan, PlanOptions(), MIRROR, settings, {})
     with UnfinishedRuns(folder) as runs:
-        return open_run(runs, identity, plan, ResumeOptions(age_max, fresh))
+        return open_run(runs, identity, plan, age_max, fresh)
 
 
 def cut_before(count: int) -> Callable[[Event], None]:
@@ -277,7 +277,7 @@ def interrupted(
     identity = identity_of(plan, options, bench.mirror, {}, {})
     for cut in (*cuts, 10**9):
         with UnfinishedRuns(folder) as runs:
-            run = open_run(runs, identity, plan, ResumeOptions(3600.0))
+            run = open_run(runs, identity, plan, 3600.0)
         check = cut_before(cut - len(run.outcome.records))
 
         def keep(event: Event, run: OpenRun = run, check: Callable[[Event], None] = check) -> None:

@@ -204,7 +204,8 @@ def test_why_a_calibration_tells_no_error_is_found_out_once(monkeypatch: pytest.
 
     monkeypatch.setattr(error_prediction, "fit_predictor", fitted)
     maps, fit = calibrated_by_pokes()
-    manager: Any = SimpleNamespace(in_use=stored("pokes", maps, fit, 1), mirror=MIRROR)
+    calibration = stored("pokes", maps, fit, 1)
+    manager: Any = SimpleNamespace(named=lambda: calibration, mirror=MIRROR)
     service = error_prediction.ErrorPrediction(manager, {})
     request = PredictError.Request(signals=doubles(np.zeros(37)))
     answers = [service.predict(request, PredictError.Response()) for _ in range(3)]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 
@@ -26,24 +26,6 @@ SCHEMA_VERSION = 1
 CALIBRATED_ERROR_MAX = 32e-9
 
 _POINTS = ("x", "y", "weight")
-#: Fields of a calibration that are attributes of its file, and their types there.
-_ATTRIBUTES: dict[str, type] = {
-    "id": str,
-    "mirror_name": str,
-    "mirror_serial": str,
-    "wavelength": float,
-    "aperture_radius": float,
-    "created_ns": int,
-    "software_version": str,
-    "dropped": tuple,
-    "targets": tuple,
-    "limitations": tuple,
-    "note": str,
-    "system_error_subtracted": int,
-    "reference_surface": str,
-    "instrument_error": float,
-    "scale_error": float,
-}
 #: Names of attributes that differ from their fields'.
 _STORED_AS = {"limitations": "known_limitations"}
 
@@ -132,6 +114,14 @@ class Calibration:
         return int((~self.fit.used).sum()) + len(self.dropped)
 
 
+#: Fields of a calibration that are attributes of its file, and their types there.
+_ATTRIBUTES: dict[str, type] = {
+    name: kind
+    for name, hint in get_type_hints(Calibration).items()
+    if (kind := get_origin(hint) or hint) in (str, int, float, tuple)
+}
+
+
 def software_version() -> str:
     """Version of this package as installed; "unknown" when run from a bare checkout."""
     try:
@@ -191,13 +181,12 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         # Nothing was known of the instrument before it was kept.
         untold: dict[str, Attribute] = {"system_error_subtracted": -1, "reference_surface": ""}
         attributes = untold | {"instrument_error": 0.0, "scale_error": 0.0} | dict(attributes)
-        result: dict[str, Any] = {"points": points}
-        for figure in fields(InfluenceFit):
-            if figure.name == "points":
-                continue
-            path = f"result/{figure.name}"
-            result[figure.name] = columns[path] if path in columns else attributes[f"fit_{figure.name}"]
-        fit = InfluenceFit(**result)
+        figures = [figure.name for figure in fields(InfluenceFit) if figure.name != "points"]
+        result: dict[str, Any] = {
+            name: columns[path] if (path := f"result/{name}") in columns else attributes[f"fit_{name}"]
+            for name in figures
+        }
+        fit = InfluenceFit(points=points, **result)
         described: dict[str, Any] = {
             name: _typed(attributes, _STORED_AS.get(name, name), kind) for name, kind in _ATTRIBUTES.items()
         }

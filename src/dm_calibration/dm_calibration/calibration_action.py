@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
-from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_maps
+from dm_calibration.calibrator import Provenance, calibrate, check_fit
 from dm_calibration.hysteresis.excitation import fewest_maps
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
@@ -20,7 +20,7 @@ from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast
 from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
-from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
+from dm_calibration.procedure.resumable_run import OpenRun, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.ros.bench_services import BenchServices
@@ -158,11 +158,10 @@ class CalibrateAction:
             "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
         }
         identity = identity_of(plan, self._options, self._mirror, settings, self._driver_facts())
-        resume = ResumeOptions(
-            self._values["resume_max_age"], self._values["start_fresh"], self._node.get_clock().now().nanoseconds
-        )
-        run = open_run(runs, identity, plan, resume, self._maps_per_state, self._goal.note)
-        if resume.fresh:  # for one goal only
+        age_max, fresh = self._values["resume_max_age"], self._values["start_fresh"]
+        now_ns = self._node.get_clock().now().nanoseconds
+        run = open_run(runs, identity, plan, age_max, fresh, now_ns, self._maps_per_state, self._goal.note)
+        if fresh:  # for one goal only
             self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
         for text in filter(None, (*run.notes, run.resumed)):
             self._node.get_logger().info(text)
@@ -242,7 +241,8 @@ class CalibrateAction:
             raise Refusal(
                 error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"
             ) from error
-        result.dropped = dropped_maps(outcome.maps(), fit, outcome.dropped)
+        rejected = zip(outcome.maps().label, fit.reasons, strict=True)
+        result.dropped = [*outcome.dropped, *(f"{label}: {reason}" for label, reason in rejected if reason)]
         result.maps = int(fit.used.sum())
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number

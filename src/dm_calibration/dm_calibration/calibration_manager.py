@@ -164,10 +164,15 @@ class CalibrationManager:
         calibration, warning = self.load("")
         return calibration, reason or warning
 
-    def _checked_in_use(self, calibration_id: str) -> Calibration:
-        calibration = self.in_use
+    def named(self, name: str = "") -> Calibration:
+        """A stored calibration by id or file, or where `name` is empty that in use. Raises Refusal if there is none."""
+        calibration = self.store.load(name) if name else self.in_use
         if calibration is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: load_calibration first")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
+        return calibration
+
+    def _checked_in_use(self, calibration_id: str) -> Calibration:
+        calibration = self.named()
         if calibration.id != calibration_id:
             raise Refusal(
                 ErrorCode.CALIBRATION_MISMATCH,

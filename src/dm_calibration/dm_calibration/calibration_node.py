@@ -31,7 +31,7 @@ from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListe
 from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, ErrorCode, error_code
 from dm_common.messages import mirror_from, recipe_book_from, recipe_book_message, time_message
 from dm_common.recipes import NO_RECIPES
 from dm_common.ros import qos
@@ -200,10 +200,7 @@ class CalibrationNode(ManagedNode):
         return response
 
     def _on_fit(self, request: Any, response: Any) -> Any:
-        named = request.calibration
-        stored = self._manager.store.load(named) if named else self._manager.in_use
-        if stored is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
+        stored = self._manager.named(request.calibration)
         if request.activate:
             self._manager.check_fits(stored)
         provenance = self._manager.provenance(stored.mirror_name, stored.mirror_serial, "")

@@ -12,7 +12,7 @@ from dm_calibration.acquisition.map_sources import Maps, outcome_of
 from dm_calibration.calibration import Calibration, software_version
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
-from dm_calibration.influence.maps import EXCITATION, SURFACE, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
@@ -107,25 +107,20 @@ def calibrate(
         Commands or times that do not belong to the maps, or time stamps that run backwards where hysteresis is to be
         identified.
     """
-    if not isinstance(maps, Outcome):
-        if commands is None:
-            raise ValueError("commands: must be given, (M, N) signals, one row for each map")
-        maps = outcome_of(maps, commands, times, mirror, settings, hysteresis)
+    if isinstance(maps, Outcome):
+        outcome = maps
+    elif commands is None:
+        raise ValueError("commands: must be given, (M, N) signals, one row for each map")
+    else:
+        outcome = outcome_of(maps, commands, times, mirror, settings, hysteresis)
     if provenance is None:
         now = time.time_ns()
         provenance = Provenance(new_id(mirror.name, mirror.serial, now), now)
-    return _evaluated(maps, mirror, options or FitOptions(), provenance, run_limitations)
-
-
-def _evaluated(
-    outcome: Outcome, mirror: Mirror, options: FitOptions, provenance: Provenance, run_limitations: Collection[str]
-) -> Calibration:
-    """Fit the maps of a run and compare the responses with the layout; where it holds excitation, hysteresis first."""
-    maps = outcome.maps()
-    hysteresis = fit_hysteresis(maps) if EXCITATION in maps.kind else None
-    fit = fit_effective(maps, hysteresis, options, mirror)
+    measured, options = outcome.maps(), options or FitOptions()
+    found = fit_hysteresis(measured) if StepKind.EXCITATION in measured.kind else None
+    fit = fit_effective(measured, found, options, mirror)
     check = check_fit(fit, mirror)
-    limitations = [*fit.limitations, *(hysteresis.remarks if hysteresis else ()), *run_limitations]
+    limitations = [*fit.limitations, *(found.remarks if found else ()), *run_limitations]
     if not outcome.radius_known:
         limitations.append(
             "The maps do not tell their aperture radius; the mirror's working aperture "
@@ -134,7 +129,7 @@ def _evaluated(
     wavelength = outcome.setup.wavelength if outcome.setup else 0.0
     if wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
-    if (parts := np.unique(maps.segment).size) > 1:
+    if (parts := np.unique(measured.segment).size) > 1:
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
     limitations += [f"Poke check: {finding}." for finding in check.findings]
     limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
@@ -147,22 +142,22 @@ def _evaluated(
         created_ns=provenance.created_ns,
         actuator_x=mirror.x,
         actuator_y=mirror.y,
-        maps=maps,
+        maps=measured,
         fit=fit,
         dropped=tuple(outcome.dropped),
         targets=tuple(outcome.targets),
         limitations=tuple(limitations),
         note=provenance.note,
         software_version=software_version(),
-        hysteresis=hysteresis,
+        hysteresis=found,
         **{name: getattr(outcome.setup, name) for name in _INSTRUMENT if outcome.setup},
-        region_weights=_region_weights(maps, fit, options),
+        region_weights=_region_weights(measured, fit, options),
     )
 
 
 def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
     """(10,) weights for commands weighted by region; empty where the maps give none."""
-    if SURFACE not in maps.kind:
+    if StepKind.SURFACE not in maps.kind:
         return np.zeros(0)
     try:
         return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
@@ -214,9 +209,3 @@ def refit(
         note=provenance.note or stored.note,
         software_version=software_version(),
     )
-
-
-def dropped_maps(maps: MapSet, fit: InfluenceFit, never_measured: Collection[str]) -> list[str]:
-    """ "label: reason" of everything that is not in the fit."""
-    rejected = [f"{maps.label[i]}: {fit.reasons[i]}" for i in np.flatnonzero(~fit.used)]
-    return [*never_measured, *rejected]

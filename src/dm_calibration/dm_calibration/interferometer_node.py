@@ -15,6 +15,7 @@ from typing import Any
 
 from dm_msgs.msg import MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
+from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -52,12 +53,11 @@ class InterferometerNode(ManagedNode):
         self._reference: SurfaceMap | None = None
         self._acquisition: Acquisition | SensorAcquisition | None = None
         self._sensor: Subscription | None = None
-        self._publishers_made = False
+        self._map_publishers: tuple[Publisher, ...] = ()
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
         self._last_taken: Measurement | None = None
-        self._warned_of_pitch = False
         self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
         # There in every state: by its lease others know that this node lives.
         self._info_publisher = self.create_lifecycle_publisher(
@@ -81,10 +81,11 @@ class InterferometerNode(ManagedNode):
         if topic := self._values["zernike_topic"]:
             self._listen_to(topic)
         # Latched: what shows the map is opened after it was taken. Who asks for qos.MAP gets later ones only.
-        self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.LATCHED)
-        self._zernike_publisher = self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE)
-        self._samples_publisher = self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE)
-        self._publishers_made = True
+        self._map_publishers = (
+            self.create_lifecycle_publisher(Image, "surface_map", qos.LATCHED),
+            self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE),
+            self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE),
+        )
 
     def _listen_to(self, topic: str) -> None:
         """Take measurements from a sensor in place of map files."""
@@ -114,11 +115,10 @@ class InterferometerNode(ManagedNode):
             self._acquisition.stop()
 
     def clean_up(self) -> None:
-        if self._publishers_made:
-            with self._publishing:
-                self._publishers_made = False
-                for publisher in (self._map_publisher, self._zernike_publisher, self._samples_publisher):
-                    self.destroy_lifecycle_publisher(publisher)
+        with self._publishing:
+            for publisher in self._map_publishers:
+                self.destroy_lifecycle_publisher(publisher)
+            self._map_publishers = ()
         if self._sensor is not None:
             self.destroy_subscription(self._sensor)
         self._acquisition = self._sensor = None
@@ -127,18 +127,15 @@ class InterferometerNode(ManagedNode):
         if not self.configured:
             raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
         with self._counting_refusals():
-            surface, measured = self._read(self._expanded(request.path))
+            if not request.path:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, "path is empty: must name a map file")
+            try:
+                path = Path(request.path).expanduser()
+            except RuntimeError as error:
+                raise MapFileError(f"{request.path}: {error}") from error
+            surface, measured = self._read(path)
         header = self._header(self._file_time(surface, believe_header=True))
         return self._accept(response, surface, measured, header, "ingested")
-
-    @staticmethod
-    def _expanded(path: str) -> Path:
-        if not path:
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, "path is empty: must name a map file")
-        try:
-            return Path(path).expanduser()
-        except RuntimeError as error:
-            raise MapFileError(f"{path}: {error}") from error
 
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         acquisition = self._acquisition
@@ -188,7 +185,6 @@ class InterferometerNode(ManagedNode):
         if self.active:
             self._publish(surface, measured, header)
         self._log_taken(surface, measured, what)
-        response.error_code = ErrorCode.OK
         name = Path(surface.file).name or surface.instrument
         shown = f"rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
         response.message = f"{what}: {name}, {shown}{_mended(surface)}"
@@ -199,25 +195,26 @@ class InterferometerNode(ManagedNode):
 
     def _publish(self, surface: SurfaceMap, measured: Measurement, header: Header) -> None:
         with self._publishing:
-            if not self._publishers_made:
+            if not self._map_publishers:
                 return
+            surface_map, zernike, samples = self._map_publishers
             # What is waited for most comes first; map and digest take longer than all before.
-            self._zernike_publisher.publish(messages.zernike_message(measured, header))
-            self._samples_publisher.publish(messages.samples_message(measured, header))
+            zernike.publish(messages.zernike_message(measured, header))
+            samples.publish(messages.samples_message(measured, header))
             self._info_publisher.publish(messages.info_message(surface, measured, header))
             if self._values["publish_map"]:
-                self._map_publisher.publish(messages.image_message(surface, header))
+                surface_map.publish(messages.image_message(surface, header))
 
     def _log_taken(self, surface: SurfaceMap, measured: Measurement, what: str) -> None:
         self._taken += self._last_taken is None or not measured.same_map(self._last_taken)
         self._last_taken, self._last_file, self._last_refusal = measured, surface.file, ""
         shown = f"PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
         self.get_logger().info(f"{what}: {surface.file or surface.instrument}: {shown}{_mended(surface)}")
-        if surface.pitch is None and not self._warned_of_pitch:
-            self._warned_of_pitch = True
+        if surface.pitch is None:
             self.get_logger().warning(
                 f"{surface.file}: the file does not tell its lateral resolution, so coefficients carry "
-                "radius 0 (unknown); set the parameter `pitch` [m per pixel]"
+                "radius 0 (unknown); set the parameter `pitch` [m per pixel]",
+                once=True,
             )
 
     @contextmanager

@@ -166,13 +166,13 @@ def test_maps_that_nothing_else_can_predict_do_not_count_as_held_out(mirror: Mir
 
 def test_what_blurs_all_actuators_is_no_fault_of_one() -> None:
     response, excited = np.full(37, 1.0), np.ones(37, dtype=bool)
-    limits = {"dead_sigmas": 3.0, "weak_sigmas": 10.0, "weak_share": 0.4}
+    options = FitOptions(dead_sigmas=3.0, weak_sigmas=10.0, weak_share=0.4)
     error = np.full(37, 0.15)
-    assert (quality.grade(response, error, excited, None, **limits) == quality.GRADE_GOOD).all()
+    assert (quality.grade(response, error, excited, None, options) == quality.GRADE_GOOD).all()
     assert "known to 15 % only" in quality.blur(response, error, excited, 10.0)[0].replace("15%", "15 %")
     assert not quality.blur(response, 0.1 * error, excited, 10.0)
     error[3] = 0.32
-    assert quality.grade(response, error, excited, None, **limits).tolist() == [0] * 3 + [quality.GRADE_WEAK] + [0] * 33
+    assert quality.grade(response, error, excited, None, options).tolist() == [0] * 3 + [quality.GRADE_WEAK] + [0] * 33
 
 
 def test_grades(mirror: Mirror) -> None:

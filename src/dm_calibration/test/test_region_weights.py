@@ -222,8 +222,6 @@ def test_too_few_or_equal_surfaces_are_refused() -> None:
     repeated = replace(maps, step=np.arange(len(maps)) % 3)
     with pytest.raises(TooFewMapsError, match=r"3 sample surfaces: .* need at least 4"):
         weighting(repeated)
-    with pytest.raises(ValueError, match="folds = 1: must be at least 2"):
-        weighting(maps, folds=1)
     with pytest.raises(ValueError, match="use AZreg"):
         weighting(
             replace(

@@ -17,7 +17,7 @@ from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.procedure.outcome import Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, open_run
+from dm_calibration.procedure.resumable_run import identity_of, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.recalibration.drift import UpdateOptions
 from dm_calibration.recalibration.updates import RecalibrationManager
@@ -106,7 +106,7 @@ def test_a_run_that_was_cut_off_goes_on(store: CalibrationStore) -> None:
     other = PlanOptions(hysteresis_maps=301)  # than it had: pokes are the same whatever a hysteresis plan would be
     identity = identity_of(plan, other, mirror, {"settle_time_s": 0.5}, {"wiring": "w"})
     with UnfinishedRuns(store.folder) as runs:
-        run = open_run(runs, identity, plan, ResumeOptions(3600.0))
+        run = open_run(runs, identity, plan, 3600.0)
         run.journal.keep(Setup(run.outcome.maps().points, 0.0, 0))  # it goes on behind the frames of then
         run.journal.close()
     assert run.resumed == f"resumed run {folder.name} with 4 maps"

@@ -13,7 +13,7 @@ import numpy as np
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.influence.maps import REFERENCE, SURFACE, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
@@ -81,7 +81,7 @@ def _run(count: int, generator: np.random.Generator) -> tuple[MapSet, Floats]:
                 residual_rms=NOISE,
                 valid_fraction=1.0,
                 label=f"map {k}",
-                kind=SURFACE if signals[k].any() else REFERENCE,
+                kind=StepKind.SURFACE if signals[k].any() else StepKind.REFERENCE,
                 step=k,
                 signals=signals[k],
                 applied=signals[k],

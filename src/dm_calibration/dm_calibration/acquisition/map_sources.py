@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
-from dm_calibration.influence.maps import CHECK, EXCITATION, POKE, REFERENCE, SURFACE
+from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.procedure.map_acquisition import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
@@ -65,9 +65,9 @@ def outcome_of(
             raise MeasurementError(error.error_code, f"{label}: {error}") from error
         if outcome.setup is None:
             outcome.take(Setup.of(one))
-            if hysteresis and kind != REFERENCE and mirror.limits.middle:
+            if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
                 # No map shows where the degauss ended, and a mirror that is driven one way ends it elsewhere than at 0.
-                rest = {"kind": REFERENCE, "step": -1, "signals": mirror.rest, "applied": mirror.rest}
+                rest = {"kind": StepKind.REFERENCE, "step": -1, "signals": mirror.rest, "applied": mirror.rest}
                 outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **rest))
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
         outcome.take(MapTaken(one, one.radius > 0.0))
@@ -99,13 +99,13 @@ def _measured(maps: Maps, settings: IngestSettings) -> list[Measurement]:
     return found
 
 
-def _kinds(signals: Floats, mirror: Mirror, hysteresis: bool) -> list[str]:
+def _kinds(signals: Floats, mirror: Mirror, hysteresis: bool) -> list[StepKind]:
     """(M,) kinds of the maps, as a run would have called them."""
     away = np.abs(signals - mirror.rest) > 1e-9
     if hysteresis:
         tested = round((1.0 - CHECK_SHARE) * len(signals))
-        kinds = [EXCITATION if number < tested else CHECK for number in range(len(signals))]
+        kinds = [StepKind.EXCITATION if number < tested else StepKind.CHECK for number in range(len(signals))]
         if not away[0].any():
-            kinds[0] = REFERENCE
+            kinds[0] = StepKind.REFERENCE
         return kinds
-    return [{0: REFERENCE, 1: POKE}.get(int(count), SURFACE) for count in away.sum(axis=1)]
+    return [{0: StepKind.REFERENCE, 1: StepKind.POKE}.get(int(count), StepKind.SURFACE) for count in away.sum(axis=1)]

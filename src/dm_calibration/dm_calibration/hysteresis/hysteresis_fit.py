@@ -13,7 +13,7 @@ from dm_calibration.hysteresis.features import weights_of
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, basis_of, run_of, without
-from dm_calibration.influence.maps import CHECK, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_common import Floats
 from dm_common.hysteresis.inverse import random_histories
 from dm_common.hysteresis.model import HysteresisModel
@@ -57,7 +57,7 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         ValueError: time stamps that run backwards.
     """
     run = run_of(maps)
-    test = np.array([kind == CHECK for kind in maps.kind])
+    test = np.array([kind == StepKind.CHECK for kind in maps.kind])
     found, run = _without_outliers(run, test, candidates)
     covariance = _error_covariance(found, run.responses.coefficients, maps)
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))

@@ -114,7 +114,7 @@ def identify_response(
     if brought.shape[1] > len(brought):
         # Fewer numbers a row, of the same sums of squares.
         brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
-    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), -BEFORE_FIRST_MAP_S)
+    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable))
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
     signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
     error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)

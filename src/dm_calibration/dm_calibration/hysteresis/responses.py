@@ -32,6 +32,9 @@ class Reduction:
     Args:
         influence_sag: (P, N) m per unit signal.
         terms: K.
+
+    Attributes:
+        coefficients, size: K - 3 and R.
     """
 
     def __init__(self, points: SamplePoints, influence_sag: Floats, terms: int) -> None:
@@ -42,16 +45,8 @@ class Reduction:
         self._scale = TERM_RMS[PISTON_TILT:terms]
         _, strength, patterns = np.linalg.svd(self._beyond(influence_sag.T), full_matrices=False)
         self._patterns = patterns[strength > WEAKEST_PATTERN * strength[0]]
-
-    @property
-    def coefficients(self) -> int:
-        """K - 3."""
-        return len(self._scale)
-
-    @property
-    def size(self) -> int:
-        """R."""
-        return len(self._scale) + len(self._patterns)
+        self.coefficients = len(self._scale)
+        self.size = self.coefficients + len(self._patterns)
 
     def _beyond(self, sag: Floats) -> Floats:
         """(..., P) weighted sag without the terms."""

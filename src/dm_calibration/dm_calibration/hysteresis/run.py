@@ -31,7 +31,7 @@ class Run:
     Attributes:
         signals: (M, N) as applied.
         time: (M,) s, of the maps, rising.
-        start: s, when the degauss had ended; None = just before the first map.
+        start: s, when the degauss had ended.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
         degaussed: (M,) before which maps, at mid range, the mirror was degaussed in its course; None = none.
@@ -44,7 +44,7 @@ class Run:
     signals: Floats
     time: Floats
     responses: Responses
-    start: float | None = None
+    start: float = -BEFORE_FIRST_MAP_S
     moved: Floats | None = None
     segment: NDArray[np.int64] | None = None
     degaussed: NDArray[np.bool_] | None = None
@@ -59,11 +59,9 @@ class Run:
     @cached_property
     def parts(self) -> list[tuple[slice, float]]:
         """Rows of each part of the run, and when the degauss before it had ended, s."""
-        first = float(self.time[0])
-        first = first - BEFORE_FIRST_MAP_S if self.start is None else min(self.start, first)
         resumed = [] if self.segment is None else (np.flatnonzero(np.diff(self.segment)) + 1).tolist()
         stood = self.time if self.moved is None else self.moved
-        starts = [first, *(float(stood[row]) - BEFORE_FIRST_MAP_S for row in resumed)]
+        starts = [min(self.start, float(self.time[0])), *(float(stood[row]) - BEFORE_FIRST_MAP_S for row in resumed)]
         bounds = pairwise((0, *resumed, len(self.time)))
         return [(slice(*bound), start) for bound, start in zip(bounds, starts, strict=True)]
 

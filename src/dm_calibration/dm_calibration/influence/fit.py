@@ -25,54 +25,13 @@ from dm_calibration.influence.regression import (
     make_design,
     regress,
 )
-from dm_calibration.influence.weights import check_epsilon
+from dm_calibration.influence.screening import FitOptions
 from dm_common import Floats
 from dm_common.errors import unknown_name
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
-from dm_common.values import live_parameter, real
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """How to fit, and from where on maps and actuators are no good.
-
-    Attributes:
-        method: a name of METHODS.
-        epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
-
-    Raises:
-        ValueError: fewer than 2 folds, or an epsilon that is not above 0.
-    """
-
-    method: str = "AZreg"
-    folds: int = 10
-    epsilon: float | None = None
-    valid_fraction_min: float = live_parameter(
-        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map that is fitted, whoever measured it."
-    )
-    outlier_sigmas: float = live_parameter(
-        real(6.0, 3.0, 1e3), "Residual of a map, in robust sigmas above the median, beyond which it is dropped."
-    )
-    hysteresis_allowance: float = live_parameter(
-        real(0.10, 0.0, 1.0),
-        "Share of their moves by which actuators may miss their mark (hysteresis: half the loop, whose width is 7-15 % "
-        "of the move) without the map being an outlier; 0 = they have none, and moves without a law of it are promised "
-        "what held-out maps show.",
-    )
-    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead below this many standard errors.")
-    weak_sigmas: float = live_parameter(
-        real(10.0, 0.0, 1e3), "Weak below this many standard errors, where they are twice those of the other actuators."
-    )
-    weak_share: float = live_parameter(real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.")
-
-    def __post_init__(self) -> None:
-        if self.folds < 2:
-            raise ValueError(f"folds = {self.folds}: must be at least 2")
-        if self.epsilon is not None:
-            check_epsilon(self.epsilon)
 
 
 @dataclass(frozen=True)
@@ -196,19 +155,36 @@ class _Fitted(NamedTuple):
     responses: Floats
 
     def worst_outlier(self, options: FitOptions) -> tuple[int, str] | None:
-        """See :func:`~dm_calibration.influence.screening.worst_outlier`."""
+        """The map that stands out most from the fit, with the reason; None when none does.
+
+        A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A
+        map is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can
+        explain: an allowance for the actuators moved, added up without coherence. A small move carries the remanence of
+        larger ones before it, so the largest move up to then counts.
+        """
         maps, regression, weight = self.maps, self.regression, self.maps.points.weight
+        judged = regression.leverage < screening.LEVERAGE_MAX
+        if judged.sum() < 3:
+            return None
+        residual = quality.seen_rms(regression.residual[:, maps.terms :], maps.sag, weight)
+        own = np.sqrt(np.maximum(1.0 - regression.leverage, 1.0 - screening.LEVERAGE_MAX))
+        scaled = np.where(judged, residual / own, 0.0)
+        median = float(np.median(scaled[judged]))
+        sigma = screening.MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
         response = np.zeros(maps.actuators)
         response[self.design.excited] = rms(regression.coefficients[self.design.drift :, maps.terms :], weight)
         rest = maps.applied[maps.reference].mean(axis=0) if maps.reference.any() else 0.0
-        return screening.worst_outlier(
-            quality.seen_rms(regression.residual[:, maps.terms :], maps.sag, weight),
-            regression.leverage,
-            maps.applied - rest,
-            response,
-            options.outlier_sigmas,
-            options.hysteresis_allowance,
-        )
+        move = np.sqrt(np.square(maps.applied - rest) @ np.square(response))
+        allowance = options.hysteresis_allowance * np.maximum.accumulate(move)
+        limit = np.maximum(np.maximum(median + options.outlier_sigmas * sigma, screening.RESIDUAL_FLOOR), allowance)
+        outside = scaled > limit
+        if not outside.any():
+            return None
+        # The square of this is what leaving the map out takes off the sum of squares. A bad map of great leverage pulls
+        # good ones out of their (narrower) limits, but takes off most itself.
+        worst = int(np.argmax(np.where(outside, scaled, 0.0)))
+        size, most = 1e9 * scaled[worst], 1e9 * limit[worst]
+        return worst, f"outlier: {size:.1f} nm rms from what the maps together say, limit {most:.1f} nm"
 
 
 def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
@@ -236,7 +212,7 @@ def _judge(
 
     residual = regression.residual
     counted = np.hstack((np.ones((len(good), terms), dtype=bool), np.isfinite(good.sag)))
-    freedom = np.maximum(counted.sum(axis=0) - design.unknowns, 1)
+    freedom = np.maximum(counted.sum(axis=0) - design.matrix.shape[1], 1)
     variance = (np.square(residual) * counted).sum(axis=0) / freedom
     scatter = float(np.sqrt(variance[terms:] @ weight / (weight @ counted[:, terms:].any(axis=0))))
     covariance = np.zeros((maps.actuators, maps.actuators))
@@ -261,15 +237,7 @@ def _judge(
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
 
     response = rms(coefficients[:, terms:], weight)
-    grades = quality.grade(
-        response,
-        standard_error,
-        design.excited,
-        rings,
-        dead_sigmas=options.dead_sigmas,
-        weak_sigmas=options.weak_sigmas,
-        weak_share=options.weak_share,
-    )
+    grades = quality.grade(response, standard_error, design.excited, rings, options)
     figure_sag = figure[:, terms:]
     return InfluenceFit(
         method=options.method,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,26 @@ from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
 
-REFERENCE = "reference"
-POKE = "poke"
-SURFACE = "surface"
-EXCITATION = "excitation"
-#: Of hysteresis too, as in use: about the flat mirror.
-IN_USE = "in_use"
-CHECK = "check"
-#: At rest, after a degauss in the course of a run.
-DEGAUSSED = "degaussed"
-KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, IN_USE, CHECK, DEGAUSSED)
 #: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
 BEFORE_FIRST_MAP_S = 1.0
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 3
+
+
+class StepKind(StrEnum):
+    """What a step of a calibration does; those that end with a map give it its kind."""
+
+    REFERENCE = "reference"
+    POKE = "poke"
+    SURFACE = "surface"
+    EXCITATION = "excitation"
+    #: Of hysteresis too, as in use: about the flat mirror.
+    IN_USE = "in_use"
+    CHECK = "check"
+    #: At rest, after a degauss in the course of a run.
+    DEGAUSSED = "degaussed"
+    #: Without a map.
+    DEGAUSS = "degauss"
 
 
 def same_points(a: SamplePoints, b: SamplePoints) -> bool:
@@ -95,13 +102,13 @@ class MapSet:
     @property
     def reference(self) -> NDArray[np.bool_]:
         """(M,) which maps are reference frames."""
-        return np.array([kind == REFERENCE for kind in self.kind], dtype=bool)
+        return np.array([kind == StepKind.REFERENCE for kind in self.kind], dtype=bool)
 
     @property
     def degaussed(self) -> NDArray[np.bool_]:
         """(M,) before which maps the mirror was degaussed in the course of the run."""
         again = np.concatenate(([False], np.diff(self.step) == 0))
-        return np.array([kind == DEGAUSSED for kind in self.kind], dtype=bool) & ~again
+        return np.array([kind == StepKind.DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
     @property
     def rest(self) -> float:

@@ -4,7 +4,7 @@ How the mirror stands in the maps as a whole is told first (:mod:`~dm_calibratio
 then belongs to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,18 +47,14 @@ class PokeCheck:
     Attributes:
         registration: how the mirror stands in the maps; None = not known.
         place: (N,) 0-based index of the configured actuator over whose place actuator i raised the surface.
-        sign: (N,) +1 or -1: which way a rising signal moves the surface; 0 = not known.
-        likeness: (N,) correlation of each response with the bump expected at `place`; 0 = no response.
         turned: whether the mirror stands turned, mirrored or shifted beyond what counts as configured.
         findings: sentences; empty = wiring and orientation are as configured.
     """
 
     registration: Registration | None
     place: Indices
-    sign: Indices
-    likeness: Floats
     turned: bool = False
-    findings: tuple[str, ...] = field(default=())
+    findings: tuple[str, ...] = ()
 
     @property
     def pose(self) -> str:
@@ -85,8 +81,8 @@ def check_pokes(
     y: Floats,
     radius: float,
     *,
-    silent: NDArray[np.bool_] | None = None,
-    unmoved: NDArray[np.bool_] | None = None,
+    silent: NDArray[np.bool_],
+    unmoved: NDArray[np.bool_],
 ) -> PokeCheck:
     """Compare measured responses with the configured layout.
 
@@ -95,19 +91,16 @@ def check_pokes(
         points: the sampling points, of the unit disc.
         x, y: (N,) configured positions, m.
         radius: of the aperture, m.
-        silent: (N,) actuators without a response above the noise; None = those without any.
-        unmoved: (N,) actuators that were not driven: left out without a finding; None = none.
+        silent: (N,) actuators without a response above the noise.
+        unmoved: (N,) actuators that were not driven: left out without a finding.
     """
     count = x.size
     if response.shape != (len(points), count):
         raise ValueError(f"response has the shape {response.shape}: must be {(len(points), count)}")
     unit, size = unit_responses(response.T, points)
-    untried = np.zeros(count, dtype=bool) if unmoved is None else unmoved
-    quiet = size <= 1e-12 * size.max(initial=0.0) if silent is None else silent | (size == 0.0)
-    quiet = quiet & ~untried
-    active = np.flatnonzero(~(quiet | untried))
-    zero = np.zeros(count, dtype=np.int64)
-    nothing = PokeCheck(None, np.arange(count), zero, np.zeros(count))
+    quiet = (silent | (size == 0.0)) & ~unmoved
+    active = np.flatnonzero(~(quiet | unmoved))
+    nothing = PokeCheck(None, np.arange(count))
     findings = _named(quiet, "show{} no response above the noise")
     if active.size < max(ANSWERS_MIN, ANSWERS_SHARE * (active.size + quiet.sum())):
         problem = (
@@ -142,9 +135,8 @@ def check_pokes(
             "mirror.actuator_x and _y, and that the maps show the whole working aperture of this mirror"
         )
         return replace(nothing, findings=(*findings, problem))
-    sign = np.sign(found).astype(np.int64)
     pose, turned = _pose_findings(registration, pitch(x, y))
-    findings += pose + _sign_findings(sign, active) + _place_findings(place)
+    findings += pose + _sign_findings(np.sign(found), active) + _place_findings(place)
     for actuator, pair in double.items():
         findings.append(f"actuator {actuator + 1} moves the places of {pair[0] + 1} and {pair[1] + 1} together")
     alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
@@ -152,7 +144,7 @@ def check_pokes(
     findings += _named(unlike, "answer{} in a way that does not look like that of one actuator")
     weak = alone & ~unlike & _weak(size, height[place], rings(x, y)[place], alone)
     findings += _named(weak, f"answer{{}} weakly, below {WEAK_SHARE:.0%} of the others of the ring")
-    return PokeCheck(registration, place, sign, np.abs(found), turned, tuple(findings))
+    return PokeCheck(registration, place, turned, tuple(findings))
 
 
 def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
@@ -261,7 +253,7 @@ def _place_findings(place: Indices) -> list[str]:
     return findings
 
 
-def _sign_findings(sign: Indices, active: Indices) -> list[str]:
+def _sign_findings(sign: Floats, active: Indices) -> list[str]:
     negative = sign < 0
     if 2 * negative.sum() <= active.size:
         return _named(negative, "move{} the surface the opposite way")

@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.maps import EXCITATION, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import Design, seen_alike
+from dm_calibration.influence.screening import FitOptions
 from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
@@ -41,24 +42,22 @@ def grade(
     standard_error: Floats,
     excited: NDArray[np.bool_],
     rings: NDArray[np.int64] | None,
-    *,
-    dead_sigmas: float,
-    weak_sigmas: float,
-    weak_share: float,
+    options: FitOptions,
 ) -> NDArray[np.uint8]:
     """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal.
 
     A response is the weighted rms sag of a unit signal, piston and tilt removed.
     """
     uncertainty = _relative(response, standard_error)
-    uncertain = (response < weak_sigmas * standard_error) & (uncertainty > STANDS_OUT * _typical(uncertainty, excited))
+    uncertain = uncertainty > STANDS_OUT * _typical(uncertainty, excited)
+    uncertain &= response < options.weak_sigmas * standard_error
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
     overall = float(np.median(response[excited])) if excited.any() else 0.0
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
-    dead = (response < dead_sigmas * standard_error) | (response < DEAD_SHARE * overall)
-    weak = uncertain | (response < weak_share * ring_median)
+    dead = (response < options.dead_sigmas * standard_error) | (response < DEAD_SHARE * overall)
+    weak = uncertain | (response < options.weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
 
@@ -190,7 +189,7 @@ def limitations(
         grades: (N,) GRADE_*.
         tested: (M,) maps that the cross-validation could judge.
     """
-    if EXCITATION in good.kind:
+    if StepKind.EXCITATION in good.kind:
         sentences = ["The influence function acts on effective signals; hysteresis and creep are in their model."]
     else:
         sentences = ["The model is linear: hysteresis and creep stay in its error."]

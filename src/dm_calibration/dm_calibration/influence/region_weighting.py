@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality
-from dm_calibration.influence.maps import SURFACE, MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress
 from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
 from dm_common import Floats
@@ -76,7 +76,7 @@ class RegionWeighting:
 
 def sample_surfaces(maps: MapSet) -> NDArray[np.bool_]:
     """(M,) which maps the region variances are taken over: the surfaces of Table 1, else all but reference frames."""
-    chosen = np.array([kind == SURFACE for kind in maps.kind], dtype=bool)
+    chosen = np.array([kind == StepKind.SURFACE for kind in maps.kind], dtype=bool)
     return chosen if np.unique(maps.step[chosen]).size >= SURFACES_MIN else ~maps.reference
 
 
@@ -96,11 +96,9 @@ def choose_weighting(
     Raises:
         TooFewMapsError: fewer than four sample surfaces.
         EmptyRegionError: a sample surface has no data in some region.
-        ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2;
-            epsilon not above 0; maps with other than 21 terms.
+        ValueError: regional errors that are the same for all surfaces, so that no weights follow; epsilon not above
+            0; maps with other than 21 terms.
     """
-    if folds < 2:
-        raise ValueError(f"folds = {folds}: must be at least 2")
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
     chosen = sample_surfaces(maps)

@@ -63,10 +63,6 @@ class Design:
     drift: int
     excited: NDArray[np.bool_]
 
-    @property
-    def unknowns(self) -> int:
-        return int(self.matrix.shape[1])
-
     @cached_property
     def basis(self) -> Floats:
         """(M, p) orthonormal columns that span the matrix."""
@@ -166,13 +162,8 @@ def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats
 
     Args:
         model: (M, P) m, sag to fill points without data from.
-
-    Raises:
-        TooFewMapsError: no map holds data.
     """
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
-    if not usable.any():
-        raise TooFewMapsError(f"none of the {len(maps)} maps holds data")
     sag = np.zeros_like(maps.sag)
     sag[usable] = fill_gaps(maps.sag[usable], model[usable], maps.points)
     return usable, sag

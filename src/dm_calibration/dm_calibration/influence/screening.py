@@ -1,9 +1,12 @@
-"""Which maps are fit for the regression, and why the others are not."""
+"""Which maps are fit for the regression, and why the others are not; the options that say so."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from dm_calibration.influence.maps import MapSet
-from dm_common import Floats
+from dm_calibration.influence.weights import check_epsilon
+from dm_common.values import live_parameter, real
 
 #: Median absolute deviation to standard deviation, for normal errors.
 MAD_TO_SIGMA = 1.4826
@@ -15,6 +18,46 @@ MISSING_POINTS_MAX = 0.2
 RESIDUAL_FLOOR = 5e-9
 #: Largest share of the maps that may be dropped as outliers.
 DROPPED_MAX = 0.25
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit, and from where on maps and actuators are no good.
+
+    Attributes:
+        method: a name of METHODS.
+        epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+
+    Raises:
+        ValueError: fewer than 2 folds, or an epsilon that is not above 0.
+    """
+
+    method: str = "AZreg"
+    folds: int = 10
+    epsilon: float | None = None
+    valid_fraction_min: float = live_parameter(
+        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map that is fitted, whoever measured it."
+    )
+    outlier_sigmas: float = live_parameter(
+        real(6.0, 3.0, 1e3), "Residual of a map, in robust sigmas above the median, beyond which it is dropped."
+    )
+    hysteresis_allowance: float = live_parameter(
+        real(0.10, 0.0, 1.0),
+        "Share of their moves by which actuators may miss their mark (hysteresis: half the loop, whose width is 7-15 % "
+        "of the move) without the map being an outlier; 0 = they have none, and moves without a law of it are promised "
+        "what held-out maps show.",
+    )
+    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead below this many standard errors.")
+    weak_sigmas: float = live_parameter(
+        real(10.0, 0.0, 1e3), "Weak below this many standard errors, where they are twice those of the other actuators."
+    )
+    weak_share: float = live_parameter(real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.")
+
+    def __post_init__(self) -> None:
+        if self.folds < 2:
+            raise ValueError(f"folds = {self.folds}: must be at least 2")
+        if self.epsilon is not None:
+            check_epsilon(self.epsilon)
 
 
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
@@ -36,44 +79,3 @@ def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
             reason = f"{missing:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
         reasons.append(reason)
     return reasons
-
-
-def worst_outlier(
-    residual_rms: Floats,
-    leverage: Floats,
-    moved: Floats,
-    response: Floats,
-    outlier_sigmas: float,
-    hysteresis_allowance: float,
-) -> tuple[int, str] | None:
-    """The map that stands out most from the fit, with the reason; None when none does.
-
-    A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A map
-    is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can explain: an
-    allowance for the actuators moved, added up without coherence. A small move carries the remanence of larger ones
-    before it, so the largest move up to then counts.
-
-    Args:
-        residual_rms: (M,) m.
-        leverage: (M,).
-        moved: (M, N) signals from where the mirror rests, normalised.
-        response: (N,) rms sag per unit signal, m.
-    """
-    judged = leverage < LEVERAGE_MAX
-    if judged.sum() < 3:
-        return None
-    scaled = np.where(judged, residual_rms / np.sqrt(np.maximum(1.0 - leverage, 1.0 - LEVERAGE_MAX)), 0.0)
-    median = float(np.median(scaled[judged]))
-    sigma = MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
-    move = np.sqrt(np.square(moved) @ np.square(response))
-    allowance = hysteresis_allowance * np.maximum.accumulate(move)
-    limit = np.maximum(np.maximum(median + outlier_sigmas * sigma, RESIDUAL_FLOOR), allowance)
-    outside = scaled > limit
-    if not outside.any():
-        return None
-    # The square of this is what leaving the map out takes off the sum of squares. A bad map of great leverage pulls
-    # good ones out of their (narrower) limits, but takes off most itself.
-    worst = int(np.argmax(np.where(outside, scaled, 0.0)))
-    return worst, (
-        f"outlier: {scaled[worst] * 1e9:.1f} nm rms from what the maps together say, limit {limit[worst] * 1e9:.1f} nm"
-    )

@@ -39,10 +39,9 @@ _RINGS = {"p43": 1, "p44": 2, "p45": 3}
 _CENTRE = {f"p{46 + k}": round(-0.8 + 0.2 * k, 1) for k in range(9)}
 _ZERNIKES = {f"pz{k + 1:02d}": k for k in range(len(ZERNIKE_NAMES))}
 
-SIGNAL_NAMES = (*_LEVELS, *_POKES, *_RINGS, *_CENTRE)
 MODEL_NAMES = (*SPHERES, *_ZERNIKES)
 #: All names of Table 1, in its order.
-TABLE_1 = SIGNAL_NAMES + MODEL_NAMES
+TABLE_1 = (*_LEVELS, *_POKES, *_RINGS, *_CENTRE, *MODEL_NAMES)
 
 
 class LinearModel(Protocol):
@@ -102,7 +101,7 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
     Table 1's -1 and +1 are the ends of the signal range.
 
     Raises:
-        ValueError: the mirror has no such actuator or ring, or the surface needs a model.
+        ValueError: the mirror has no such actuator or ring.
     """
     if reason := missing_on(name, mirror):
         raise ValueError(reason)
@@ -113,10 +112,8 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
         table[_POKES[name]] = 1.0
     elif name in _RINGS:
         table[mirror.rings == _RINGS[name]] = 1.0
-    elif name in _CENTRE:
-        table[0] = _CENTRE[name]
     else:
-        raise ValueError(f"{name} does not prescribe signals")
+        table[0] = _CENTRE[name]
     middle, half = mirror.rest[0], mirror.limits.half_range
     signals, factor = mirror.limits.scaled(middle + half * table)
     remark = "" if factor == 1.0 else f"{name}: scaled about its mean to {factor:.0%} to keep the mirror's limits"
@@ -165,7 +162,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
     if name in SPHERES:
         nominal = conic_coefficients(1.0 / SPHERES[name], 0.0, mirror.working_radius)
         wanted = f"sphere of radius {SPHERES[name]:+g} m"
-    elif name in _ZERNIKES:
+    else:
         index = ZERNIKE_INDEX[_ZERNIKES[name]]
         unit = np.zeros(len(TERMS))
         unit[index] = 1.0
@@ -181,8 +178,6 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
             return Surface(name, signals, 0.0 * unit, target=target)
         nominal = amplitude * unit
         wanted = f"{ZERNIKE_NAMES[_ZERNIKES[name]]} of {amplitude * 1e9:.0f} nm"
-    else:
-        raise ValueError(f"{name} prescribes signals, not a shape")
     signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
     signals, factor = mirror.limits.scaled(signals)
     described = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dm_calibration.influence.maps import DEGAUSSED, REFERENCE
+from dm_calibration.influence.maps import StepKind
 from dm_calibration.procedure.outcome import MapTaken
 from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
@@ -61,11 +61,11 @@ class BumpCheck:
     def take(self, taken: MapTaken) -> None:
         """Take a good map, which later reference frames are compared with."""
         record = taken.record
-        if record.kind == REFERENCE:
+        if record.kind == StepKind.REFERENCE:
             self._last = taken
             self._moved = np.zeros_like(self._moved)
             return
-        if record.kind == DEGAUSSED:
+        if record.kind == StepKind.DEGAUSSED:
             self.degaussed()
         away = record.applied - self._rest
         self._moved = np.maximum(self._moved, np.abs(away))

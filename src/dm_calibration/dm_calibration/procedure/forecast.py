@@ -93,9 +93,12 @@ def forecast(
     # Of a single actuator no neighbour's distance tells the width of its bump.
     if (earlier is None and mirror.x.size < 2) or len(signals) < len(steps) or not check.any():
         return Forecast(duration, 0.0)
-    noise, influence = TYPICAL_NOISE, earlier.fit.influence_zernike if earlier else typical_influence(mirror)
     if earlier is not None:
+        influence = earlier.fit.influence_zernike
         noise = math.sqrt(earlier.maps.noise_variance().mean()) or TYPICAL_NOISE
+    else:
+        places = mirror.x / mirror.working_radius, mirror.y / mirror.working_radius
+        influence, noise = typical_response(*places, edge_clustered_points())[0].T, TYPICAL_NOISE
     law = left_of_one_map(earlier, mirror)
     parts = [*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(steps)]
     expected = Forecast(duration, 0.0)
@@ -146,16 +149,10 @@ def expected_end(plan: Plan, done: int, reached: float, until: float, law: float
     return ends[k], float(expected[k])
 
 
-def typical_influence(mirror: Mirror) -> Floats:
-    """(21, N) m per unit signal, as the data sheet of a piezo mirror lets expect."""
-    points = edge_clustered_points()
-    return typical_response(mirror.x / mirror.working_radius, mirror.y / mirror.working_radius, points)[0].T
-
-
 def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
     """(N, 21) coefficients and (N, P) sag, m per unit signal, of actuators at x, y (N,), in radii of the aperture.
 
-    Piston and tilt of the sag are removed.
+    As the data sheet of a piezo mirror lets expect; piston and tilt of the sag are removed.
     """
     shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
     sag = TYPICAL_RISE * size[:, None] * shape

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.influence.maps import REFERENCE, same_points
+from dm_calibration.influence.maps import StepKind, same_points
 from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
 from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
-from dm_calibration.procedure.plan import Step, StepKind
+from dm_calibration.procedure.plan import Step
 from dm_common import Floats
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench, Measurement
@@ -104,7 +104,7 @@ class MapAcquisition:
                 f"{label}: {suspicion}: the mirror does not stand as it did before the run was interrupted. Put it "
                 "back, or begin anew (`dm calibrate --fresh`)",
             )
-        frames = [index for index, record in enumerate(self.outcome.records) if record.kind == REFERENCE]
+        frames = [index for index, record in enumerate(self.outcome.records) if record.kind == StepKind.REFERENCE]
         doubtful = len(self.outcome.records) - frames[-1] - 1
         self._note(Doubted(frames[-1] + 1, f"in doubt, bumped before {label}"))
         raise Refusal(

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, StrEnum
+from enum import StrEnum
 
 import numpy as np
 
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS, excitation, fewest_maps, next_part
 from dm_calibration.influence import surfaces
+from dm_calibration.influence.maps import StepKind
 from dm_common import Floats
 from dm_common.mirror import Mirror
 from dm_common.values import live_parameter, real, whole
@@ -35,19 +36,6 @@ class PlanKind(StrEnum):
     SURFACES = "surfaces"
     POKE_CHECK = "poke_check"
     HYSTERESIS = "hysteresis"
-
-
-class StepKind(Enum):
-    """What a step does; the measured kinds are those of :mod:`dm_calibration.influence.maps`."""
-
-    DEGAUSS = "degauss"
-    REFERENCE = "reference"
-    POKE = "poke"
-    SURFACE = "surface"
-    EXCITATION = "excitation"
-    IN_USE = "in_use"
-    CHECK = "check"
-    DEGAUSSED = "degaussed"
 
 
 @dataclass(frozen=True)

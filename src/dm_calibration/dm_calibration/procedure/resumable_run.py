@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import software_version
@@ -38,21 +37,6 @@ class OpenRun:
     storing: Storing | None = None
     resumed: str = ""
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class ResumeOptions:
-    """Whether to go on with a run.
-
-    Attributes:
-        age_max: s since its last event; 0 = never.
-        fresh: do not go on with any, this time.
-        now_ns: time of the clock that maps are stamped with, ns; 0 = not known.
-    """
-
-    age_max: float
-    fresh: bool = False
-    now_ns: int = 0
 
 
 def mirror_facts(mirror: Mirror) -> dict[str, Any]:
@@ -98,11 +82,18 @@ def open_run(
     runs: UnfinishedRuns,
     identity: Mapping[str, Any],
     plan: Plan,
-    options: ResumeOptions,
+    age_max: float,
+    fresh: bool = False,
+    now_ns: int = 0,
     maps_per_state: int = 1,
     note: str = "",
 ) -> OpenRun:
     """Go on with the newest unfinished run of the same identity, or begin one.
+
+    Args:
+        age_max: s since the last event of one to go on with; 0 = never.
+        fresh: do not go on with any, this time.
+        now_ns: time of the clock that maps are stamped with, ns; 0 = not known.
 
     Raises:
         StoreError: the journal cannot be written, or there is no room for all maps.
@@ -110,7 +101,7 @@ def open_run(
     notes = [f"unfinished run {text}" for text in runs.others(identity)]
     chosen: Kept | None = None
     for found in runs.find(identity, plan.remarks):
-        reason = "a newer one goes on" if chosen else _reason_against(found, plan, options)
+        reason = "a newer one goes on" if chosen else _reason_against(found, plan, age_max, fresh, now_ns)
         if not reason:
             chosen = found
             continue
@@ -134,23 +125,20 @@ def open_run(
     return OpenRun(journal, chosen.outcome, chosen.storing, text, tuple(notes))
 
 
-def _reason_against(found: Kept, plan: Plan, options: ResumeOptions) -> str:
+def _reason_against(found: Kept, plan: Plan, age_max: float, fresh: bool, now_ns: int) -> str:
     """Why an unfinished run is not to go on; "" = it is."""
     age = 1e-9 * (time.time_ns() - found.last_ns)
-    if options.fresh:
+    if fresh:
         return "a fresh run was asked for"
-    if not options.age_max:
+    if not age_max:
         return "resume_max_age = 0"
-    if age > options.age_max:
-        return f"it is {age:.0f} s old, resume_max_age is {options.age_max:.0f} s"
+    if age > age_max:
+        return f"it is {age:.0f} s old, resume_max_age is {age_max:.0f} s"
     latest = max((record.stamp_ns for record in found.outcome.records), default=0)
-    if plan.kind is PlanKind.HYSTERESIS and options.now_ns and options.now_ns < latest:
-        return f"the clock is {1e-9 * (latest - options.now_ns):.0f} s before its last map: creep needs times that rise"
+    if plan.kind is PlanKind.HYSTERESIS and now_ns and now_ns < latest:
+        return f"the clock is {1e-9 * (latest - now_ns):.0f} s before its last map: creep needs times that rise"
     return ""
 
 
 def _hash(*arrays: NDArray[Any]) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()

@@ -36,7 +36,7 @@ class ErrorPrediction:
         Raises:
             Refusal, ValueError, StoreError: see :mod:`~dm_common.errors`; nothing has changed then.
         """
-        stored = self._manager.store.load(request.calibration) if request.calibration else self._in_use()
+        stored = self._manager.named(request.calibration)
         options = _selection(request.p_enter, request.p_remove)
         with self._lock:
             predictor = self._fitted(stored, request.method or stored.fit.method, options)
@@ -59,7 +59,7 @@ class ErrorPrediction:
         Raises:
             Refusal, ValueError: see :mod:`~dm_common.errors`.
         """
-        calibration = self._in_use()
+        calibration = self._manager.named()
         mirror = self._manager.mirror
         low, high = (mirror.limits.low, mirror.limits.high) if mirror else (-1.0, 1.0)
         signals = np.array(request.signals, dtype=np.float64)
@@ -82,12 +82,6 @@ class ErrorPrediction:
         method = predictor.influence.method
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
         return response
-
-    def _in_use(self) -> Calibration:
-        calibration = self._manager.in_use
-        if calibration is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
-        return calibration
 
     def _fitted(self, stored: Calibration, method: str, options: SelectionOptions | None) -> ErrorPredictor:
         influence = stored.fit

@@ -62,8 +62,7 @@ class RunHistory:
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
         responses = Responses(self._sag, 0, self._usable)
-        start = float(moved[0]) - BEFORE_FIRST_MAP_S
-        run = Run(maps.applied, time, responses, start, moved, maps.segment, maps.degaussed, maps.rest)
+        run = Run(maps.applied, time, responses, -BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed, maps.rest)
         self._plays = run.along(lambda signals: play_features(signals, self._radius, 1, maps.rest))
         self._crept = run.crept(self._plays)
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import RBFInterpolator
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.influence.maps import KINDS
+from dm_calibration.influence.maps import StepKind
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
 from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, YELLOW
 from dm_common import Floats
@@ -23,7 +23,8 @@ NM, MM = 1e9, 1e3
 PIXELS = 61
 #: Small maps in a row.
 COLUMNS = 7
-KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, SKY_BLUE, PURPLE, YELLOW), strict=True))
+#: A degauss, the last kind, has no map.
+KIND_COLOURS: dict[str, str] = dict(zip(StepKind, (GREY, BLUE, GREEN, ORANGE, SKY_BLUE, PURPLE, YELLOW), strict=False))
 
 
 def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:
