@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rclpy
 from dm_msgs.msg import FocusRequest, FocusState
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Range
@@ -46,5 +47,5 @@ if __name__ == "__main__":
     rclpy.init()
     try:
         rclpy.spin(VisionNode())
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, or whoever started it ends it
         pass

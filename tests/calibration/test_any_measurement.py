@@ -112,6 +112,8 @@ def test_what_is_refused() -> None:
         identify_response(commands, measured, times[:4])
     with pytest.raises(ValueError, match="time stamps: map 2"):
         identify_response(commands, measured, -times)
+    with pytest.raises(ValueError, match="measured: each row holds NaN"):
+        identify_response(commands, np.where(np.arange(measured.shape[1]) == 2, np.nan, measured), times)
     with pytest.raises(ValueError, match="times: all are the same"):
         identify_response(commands, measured, np.ones_like(times))
     for array, text in ((commands, "commands: row 7 holds NaN"), (times, "times: number 7 is NaN")):

@@ -104,8 +104,8 @@ def calibrate(
     TooFewMapsError
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError
-        Commands or times that do not belong to the maps, or time stamps that run backwards where hysteresis is to be
-        identified.
+        Commands or times that do not belong to the maps, commands that are not normalised, or times that are not given,
+        all the same or run backwards where hysteresis is to be identified.
     """
     if isinstance(maps, Outcome):
         outcome = maps

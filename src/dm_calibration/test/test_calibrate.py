@@ -21,6 +21,7 @@ from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -92,6 +93,9 @@ def test_a_folder_of_maps_whose_names_end_in_capitals(tmp_path: Path) -> None:
     (tmp_path / "1.4D").write_bytes(four_d_bytes(seen(plant, inside, commands)[0] / 632.8e-9))
     outcome = outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS))
     assert [Path(record.file).name for record in outcome.records] == ["1.4D"]
+    # Such a file does not tell its time, and a copy of it was written when it was copied.
+    with pytest.raises(ValueError, match="times: hysteresis and creep"):
+        outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS), True)
 
 
 def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
@@ -119,6 +123,21 @@ def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
     maps = replace(calibration.maps, applied=calibration.maps.applied + 1.0)
     pulled = fit_influence(maps, rings=MIRROR.rings, limits=replace(MIRROR.limits, low=0.0, high=2.0))
     assert pulled.held_out_max_zernike == pytest.approx(bound, rel=1e-6)
+    # Maps at mid range that are no reference frames take nothing off it.
+    unnamed = replace(calibration.maps, kind=("poke",) * len(calibration.maps))
+    assert not unnamed.applied[0].any()
+    rested = fit_influence(unnamed, rings=MIRROR.rings, limits=MIRROR.limits)
+    assert rested.held_out_max_zernike > 0.8 * bound
+    # Nor does an actuator without a channel, which stands elsewhere.
+    commands = calibration.maps.applied.copy()
+    commands[:, -1] = -1.0
+    measured = []
+    for row in commands:
+        bench.apply(row)
+        measured.append(bench.measure("again"))
+    missing = calibrate(measured, commands, mirror=MIRROR)
+    assert missing.maps.kind[:3] == ("reference", "poke", "poke")
+    assert missing.promise == pytest.approx(bound, rel=0.2)
 
 
 def test_arrays_of_commands_times_and_maps(
@@ -170,8 +189,19 @@ def test_measurements_and_what_is_refused() -> None:
         calibrate(sag, commands[:3], mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match=r"times has the shape \(2,\)"):
         calibrate(sag, commands, [0.0, 1.0], mirror=mirror, settings=settings)
+    with pytest.raises(ValueError, match=r"times .* goes up to 1\.7e\+18: must be .* s"):
+        calibrate(sag, commands, np.full(len(sag), 1.7e18), mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match="times: hysteresis and creep"):
         calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
+    with pytest.raises(ValueError, match="times: all are the same"):
+        calibrate(sag, commands, np.zeros(len(sag)), mirror=mirror, settings=settings, hysteresis=True)
+    with pytest.raises(ValueError, match="commands reach 75: must be normalised to -1 to 1"):
+        calibrate(sag, 150.0 * commands, mirror=mirror, settings=settings)
+    gap = np.where(np.arange(len(sag))[:, None] == 3, np.nan, commands)
+    with pytest.raises(ValueError, match="commands: row 4 holds NaN"):
+        calibrate(sag, gap, mirror=mirror, settings=settings)
+    with pytest.raises(InsufficientDataError, match="map 2: 0 valid pixels"):
+        calibrate([sag[0], np.full_like(sag[1], np.nan), *sag[2:]], commands, mirror=mirror, settings=settings)
     # A degauss ends at mid range, also where no map shows it.
     for low, rest in ((-1.0, 0.0), (-0.5, 0.25)):
         pulled = replace(mirror, limits=replace(mirror.limits, low=low))

@@ -178,12 +178,17 @@ class Connection:
     ) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
-        Ctrl-C and `stop` cancel it, so that the mirror is left safe; `identity`: see `run_goal`.
+        Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel it, so that the mirror is left safe;
+        `identity`: see `run_goal`.
         """
+        failed: list[Exception] = []
 
         def take(feedback: Any) -> None:
             self._servers[name].heard()  # who speaks lives, even if this process missed that on a busy machine
-            on_feedback(feedback)
+            try:
+                on_feedback(feedback)
+            except Exception as error:  # in the executor it would end the whole process
+                failed.append(error)
 
         with self._answered(name) as gone:
             result = run_goal(
@@ -192,10 +197,12 @@ class Connection:
                 timeout_s,
                 answer_s=self._timeout_s,
                 on_feedback=take,
-                stop=stop,
+                stop=lambda: bool(failed) or stop(),
                 gone=gone,
                 identity=identity,
             )
+        if failed:
+            raise failed[0]
         return checked(result)
 
     @contextmanager

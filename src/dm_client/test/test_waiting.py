@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from dm_msgs.action import Converge
@@ -59,3 +60,25 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "run_goal", run_goal)
     asked.run_action("converge", Converge.Goal(), feedback.append, 1.0)
     assert (heard, feedback) == ([0], ["step 1"])
+
+
+def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rclpy's executor ends the whole process with it."""
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    server = SimpleNamespace(heard=lambda: None, wait_for_return=lambda: None, since_now=lambda: lambda: "")
+    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
+    cancelled = list[bool]()
+
+    def run_goal(*_arguments: object, on_feedback: Any, stop: Any, **_options: object) -> Converge.Result:
+        cancelled.append(stop())
+        on_feedback("step 1")
+        cancelled.append(stop())
+        return Converge.Result(error_code=ErrorCode.CANCELED)
+
+    def fail(_feedback: object) -> None:
+        raise ZeroDivisionError("mine")
+
+    monkeypatch.setattr(connection, "run_goal", run_goal)
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        asked.run_action("converge", Converge.Goal(), fail, 1.0)
+    assert cancelled == [False, True]

@@ -150,6 +150,7 @@ def test_settings_frames_change_the_outputs_and_are_counted() -> None:
     ("config", "name"),
     [
         (DriveConfig(wiring=(1,) * 37), "wiring"),
+        (DriveConfig(wiring=()), "wiring"),
         (DriveConfig(wiring=(*TRIHEX[:-1], 40)), "wiring"),
         (DriveConfig(dac_volts_at_full=0.0), "dac_volts_at_full"),
         (DriveConfig(volts_max=0.0), "volts.max"),

@@ -58,6 +58,13 @@ def test_the_map_is_the_plate_seen_from_above(plate: Plate, diameter: float) -> 
     np.testing.assert_allclose(sag[inside], direct, atol=1e-12)
 
 
+def test_beyond_the_rim_of_the_mirror_there_is_nothing(plate: Plate) -> None:
+    camera = make(replace(QUIET, mount_x=6e-3, pixels=90), plate)
+    x, y = pixel_grid(camera)
+    on_mirror = (np.hypot(x - 6e-3, y) <= 0.015) & (np.hypot(x, y) <= 0.011)
+    np.testing.assert_array_equal(np.isfinite(camera.measure(poke(1))), on_mirror)
+
+
 @pytest.mark.parametrize(
     ("turn", "right_and_up"),
     [

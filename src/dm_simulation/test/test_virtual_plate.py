@@ -166,6 +166,12 @@ def test_other_numbers_of_actuators() -> None:
         Plate(PlateConfig(actuator_x=(-0.004, 0.0, 0.004), actuator_y=(0.0, 0.0, 0.0)))
 
 
+def test_actuators_at_the_same_place_are_named() -> None:
+    plate = Plate(PlateConfig(actuator_x=(0.0, 5e-3, 0.0, 5e-3), actuator_y=(0.0, 0.0, 5e-3, 0.0)))
+    with pytest.raises(ValueError, match="actuators 2 and 4 are at the same place"):
+        neighbour_pairs(plate.x, plate.y)
+
+
 def test_design_numbers(plate: Plate) -> None:
     """Agreed: condition number 11.8 for Zernikes 2-21, coupling 0.46, up to 83 nm beyond 21 terms for one poke of full
     stroke, fitting limit 3.0 / 7.7 / 16.5 nm rms at 20 / 22 / 24 mm. A 1 mm plate: 3.7 and 0.12.

@@ -5,12 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
+from dm_calibration.hysteresis.response_fit import check_signals
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.procedure.map_acquisition import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
 from dm_common import Floats
@@ -20,6 +22,9 @@ from dm_common.mirror import Mirror
 
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
+
+#: Least time that stamps in ns do not hold, s.
+TIME_MAX_S = 9e9
 
 #: Endings of the map files that are taken from a folder, in small letters; those of files may be in capitals.
 SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4d")
@@ -41,23 +46,31 @@ def outcome_of(
     measured = _measured(maps, settings or IngestSettings(aperture_radius=mirror.working_radius))
     count = len(measured)
     signals = np.asarray(commands, dtype=np.float64)
-    if signals.shape != (count, mirror.actuators) or not np.isfinite(signals).all():
+    if signals.shape != (count, mirror.actuators):
         raise ValueError(
             f"commands has the shape {signals.shape}: must be ({count}, {mirror.actuators}) finite numbers, a row for "
             "each map and a column for each actuator"
         )
+    check_signals(signals)
     if times is not None:
         taken = np.asarray(times, dtype=np.float64)
-        if taken.shape != (count,) or not np.isfinite(taken).all():
-            raise ValueError(f"times has the shape {taken.shape}: must be ({count},) finite numbers, s")
+        if taken.shape != (count,) or not (np.abs(taken) < TIME_MAX_S).all():
+            raise ValueError(
+                f"times has the shape {taken.shape} and goes up to {taken.max(initial=0.0):g}: must be ({count},) "
+                "finite numbers, s"
+            )
         measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
     elif not all(one.stamp_ns for one in measured):
         if hysteresis:
             raise ValueError("times: hysteresis and creep cannot be told apart without; give s, one for each map")
         measured = [replace(one, stamp_ns=number * 10**9) for number, one in enumerate(measured)]
+    if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
+        raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
     outcome = Outcome()
+    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # who never moves may stand anywhere
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
-    for number, (one, row, kind) in enumerate(zip(measured, signals, _kinds(signals, mirror, hysteresis), strict=True)):
+    kinds = _kinds(np.abs(signals - rest) > 1e-9, hysteresis)
+    for number, (one, row, kind) in enumerate(zip(measured, signals, kinds, strict=True)):
         label = f"{number + 1} {Path(one.file).name}" if one.file else f"map {number + 1}"
         try:
             check_comparable(one, outcome, mirror.working_radius)
@@ -67,8 +80,8 @@ def outcome_of(
             outcome.take(Setup.of(one))
             if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
                 # No map shows where the degauss ended, and a mirror that is driven one way ends it elsewhere than at 0.
-                rest = {"kind": StepKind.REFERENCE, "step": -1, "signals": mirror.rest, "applied": mirror.rest}
-                outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **rest))
+                begin = {"kind": StepKind.REFERENCE, "step": -1, "signals": rest, "applied": rest}
+                outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **begin))
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
         outcome.take(MapTaken(one, one.radius > 0.0))
     return outcome
@@ -82,29 +95,32 @@ def _measured(maps: Maps, settings: IngestSettings) -> list[Measurement]:
         if not maps:
             raise ValueError(f"{folder}: holds no map file ({', '.join(SUFFIXES)})")
     ingest, found = Ingest(), []
-    for one in maps:
+    for number, one in enumerate(maps, 1):
         if isinstance(one, Measurement):
             found.append(one)
         elif isinstance(one, str | Path):
             surface, measured = ingest.read(Path(one), settings)
-            at = surface.time_stamp or 1e-9 * surface.written_ns
-            found.append(replace(measured, stamp_ns=round(1e9 * at), sha256=surface.sha256))
+            # Not when they were written: copies tell when they were copied.
+            stamp_ns = round(1e9 * (surface.time_stamp or 0.0))
+            found.append(replace(measured, stamp_ns=stamp_ns, sha256=surface.sha256))
         else:
             sag = np.asarray(one, dtype=np.float64)
             if sag.ndim != 2:
                 raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
-            found.append(ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1])
+            try:
+                found.append(ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1])
+            except (InsufficientDataError, MapRejectedError) as error:
+                raise type(error)(f"map {number}: {error}") from error
     if not found:
         raise ValueError("maps: there is none")
     return found
 
 
-def _kinds(signals: Floats, mirror: Mirror, hysteresis: bool) -> list[StepKind]:
-    """(M,) kinds of the maps, as a run would have called them."""
-    away = np.abs(signals - mirror.rest) > 1e-9
+def _kinds(away: NDArray[np.bool_], hysteresis: bool) -> list[StepKind]:
+    """(M,) kinds of the maps, as a run would have called them, by which actuators (M, N) are away from rest."""
     if hysteresis:
-        tested = round((1.0 - CHECK_SHARE) * len(signals))
-        kinds = [StepKind.EXCITATION if number < tested else StepKind.CHECK for number in range(len(signals))]
+        tested = round((1.0 - CHECK_SHARE) * len(away))
+        kinds = [StepKind.EXCITATION if number < tested else StepKind.CHECK for number in range(len(away))]
         if not away[0].any():
             kinds[0] = StepKind.REFERENCE
         return kinds

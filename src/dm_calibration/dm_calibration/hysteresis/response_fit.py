@@ -98,7 +98,8 @@ def identify_response(
     ExcitationError
         Too few measurements, or more than a tenth of the actuators, and more than one, that hardly move or turn.
     ValueError
-        Arrays that do not belong together, measurements that never change, or times that run backwards.
+        Arrays that do not belong together, measurements without a whole row or that never change, or times that run
+        backwards.
     """
     signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
     if values.ndim != 2 or len(values) != len(signals):
@@ -107,7 +108,9 @@ def identify_response(
     if not np.ptp(seconds) > 0.0:
         raise ValueError("times: all are the same; leave them out where they are not known")
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
-    size = float(values[usable].std(axis=0).max()) if usable.any() else 0.0
+    if not usable.any():
+        raise ValueError("measured: each row holds NaN or an infinity; leave out columns that do in all rows")
+    size = float(values[usable].std(axis=0).max())
     if not size > 0.0:
         raise ValueError("measured: nothing in it changes")
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
@@ -138,12 +141,17 @@ def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
     signals = np.asarray(commands, dtype=np.float64)
     if signals.ndim != 2 or not signals.size or signals.shape[1] != (actuators or signals.shape[1]):
         raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, {actuators or 'actuators'})")
+    check_signals(signals)
+    return signals
+
+
+def check_signals(signals: Floats) -> None:
+    """Raise ValueError where `signals` (M, N) are not finite and normalised, as volts are not."""
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
     if not finite.all():
         raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")
     if np.abs(signals).max() > 1.0 + 1e-9:
         raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
-    return signals
 
 
 def _seconds(times: ArrayLike | None, count: int) -> Floats:

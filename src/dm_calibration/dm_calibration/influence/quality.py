@@ -22,6 +22,8 @@ STANDS_OUT = 2.0
 
 #: Maps show hysteresis that no law describes from this share of their moves on; what is less may be noise.
 LOOPS_SHOW = 0.01
+#: Least size of a move, m: a map at mid range shows no share of one.
+NO_MOVE = 1e-15
 #: Moves in use go up to twice as far as those of pokes, and loops widen with the way, ...
 LOOPS_WIDEN = 2.0
 #: ... but not beyond this, in what single actuators are allowed to miss: together they err alike.
@@ -136,7 +138,7 @@ def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.b
         tested: (M,) which maps count.
         allowance: share of an actuator's move by which it may miss.
     """
-    size = np.maximum(rms(moved, weight), np.finfo(float).tiny)
+    size = np.maximum(rms(moved, weight), NO_MOVE)
     along = np.abs((left[tested] * moved[tested]) @ weight) / (size * np.maximum.accumulate(size))[tested]
     shown = float(np.percentile(along, 95.0))
     return min(LOOPS_WIDEN * shown, LOOPS_WIDEST * allowance) if shown > LOOPS_SHOW else 0.0

@@ -57,7 +57,7 @@ class DriveUnit:
         self.config = config
         wiring = np.asarray(config.wiring, int)
         last = config.channels - 1
-        if len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
+        if not wiring.size or len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
             raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to {last}")
         low, high = self._signal_range
         square = " squared" if config.squared else ""

@@ -138,9 +138,9 @@ class Interferometer:
             share = 1.0 / (1.0 + config.distortion * squares * share**2)
         true_y, true_x = -centres[:, None] * share, centres * share
         self._true_pixels = 0.5 * config.pixels * (np.array((-true_y, true_x)) + 1.0) - 0.5  # row, column
-        if config.mask_diameter:
-            x, y = self._on_mirror(true_x * self._field_radius, true_y * self._field_radius, config)
-            self._outside |= np.hypot(x, y) > config.mask_diameter / 2
+        x, y = self._on_mirror(true_x * self._field_radius, true_y * self._field_radius, config)
+        edge = min(config.mask_diameter or np.inf, plate.config.diameter * (1 + 1e-9)) / 2
+        self._outside |= np.hypot(x, y) > edge
         self._columns = chebyshev.chebvander(centres, degree)
         self._rows = self._columns[::-1].copy()
 

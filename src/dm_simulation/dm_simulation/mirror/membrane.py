@@ -65,7 +65,7 @@ class Membrane:
     def __init__(self, config: MembraneConfig, rng: np.random.Generator, time: float = 0.0) -> None:
         self.config = config
         self.radius = config.diameter / 2
-        self.x, self.y = actuator_positions(config.pitch, actuators=config.actuators)
+        self.x, self.y = actuator_positions(config.pitch, actuators=config.actuators, name="membrane.actuators")
         if np.hypot(self.x, self.y).max() + config.electrode_diameter / 2 > self.radius:
             raise ValueError(
                 f"membrane.pitch = {config.pitch:g} m: electrodes beyond the edge of the membrane,"

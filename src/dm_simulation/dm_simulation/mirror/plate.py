@@ -43,12 +43,16 @@ class PlateConfig:
 
 
 def actuator_positions(
-    pitch: float, start_angle: float = 0.0, clockwise: bool = False, actuators: int = 37
+    pitch: float,
+    start_angle: float = 0.0,
+    clockwise: bool = False,
+    actuators: int = 37,
+    name: str = "plate.actuators",
 ) -> tuple[Array, Array]:
     """Positions x, y (N,) in m of the actuators 1..N.
 
     Raises:
-        ValueError: no number of full rings has that many.
+        ValueError: no number of full rings has that many, as the parameter `name` asks for.
     """
     corners = np.exp(1j * np.pi / 3 * np.arange(7))
     grid = [np.zeros(1, complex)]
@@ -60,7 +64,7 @@ def actuator_positions(
         ring += 1
     if placed != actuators:
         raise ValueError(
-            f"plate.actuators = {actuators}: full rings hold 1, 7, 19, 37, 61, ...; give plate.actuator_x and _y"
+            f"{name} = {actuators}: full rings hold 1, 7, 19, 37, 61, ...; of others give plate.actuator_x and _y"
         )
     points = np.concatenate(grid)
     points = pitch * np.exp(1j * start_angle) * (points.conj() if clockwise else points)
@@ -68,10 +72,17 @@ def actuator_positions(
 
 
 def neighbour_pairs(x: Array, y: Array) -> NDArray[np.intp]:
-    """Pairs (P, 2) of 0-based actuators closer than 1.2 times the smallest distance."""
+    """Pairs (P, 2) of 0-based actuators closer than 1.2 times the smallest distance.
+
+    Raises:
+        ValueError: two at the same place.
+    """
     distance = np.hypot(x[:, None] - x, y[:, None] - y)
     first, second = np.triu_indices(len(x), k=1)
     apart = distance[first, second]
+    if not apart.min() > 0:
+        pair = first[apart.argmin()] + 1, second[apart.argmin()] + 1
+        raise ValueError("plate.actuator_x and _y: actuators {} and {} are at the same place".format(*pair))
     near = apart < 1.2 * apart.min()
     return np.stack([first[near], second[near]], axis=1)
 
