@@ -97,6 +97,22 @@ def test_the_vision_node_asks_for_what_the_python_one_does(programs: Path, obser
     assert curvatures == pytest.approx({s: optics.curvature_for(dioptre_of(d)) for s, d in distances.items()})
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("request_focus --ros-args -r __ns:=/left", "no action move_focus"),  # the curvature may be left out
+        ("request_focus 0.01 --ros-args -r __ns:=/left", "no action move_focus"),
+        ("request_focus 1/50", "curvature 1/50: must be a number"),
+        ("vision_node --ros-args -p rest_distance:=-1.0", "rest_distance = -1.000000 m: must be above 0"),
+    ],
+)
+def test_what_they_are_started_with_is_refused_in_words(programs: Path, domain: int, command: str, said: str) -> None:
+    program, *arguments = command.split()
+    ended = subprocess.run([str(programs / program), *arguments], capture_output=True, text=True, timeout=60.0)
+    assert ended.returncode == 1 and said in ended.stderr
+
+
 def test_its_package_names_what_it_uses() -> None:
     used = {name for source in SOURCES for name in re.findall(r'#include "(\w+)/', source.read_text())}
     package = ElementTree.parse(EXAMPLE / "package.xml").getroot()

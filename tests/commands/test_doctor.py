@@ -267,7 +267,9 @@ def test_a_port_in_use_is_named() -> None:
         driver = {"electronics.address": "127.0.0.1", "electronics.port": port, "mirror.actuators": 37}
         assert electronics.opens("edac40_tcp", driver) is None
         finding = doctor_bench.taken_ports(GOOD["virtual_bench"] | {"trigger.port": port})
+        wrong = doctor_bench.taken_ports({"trigger.port": port, "electronics.tcp_port": str(port)})
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
+    assert wrong is not None and "electronics.tcp_port" not in wrong.problem  # which the node refuses
     gone = electronics.opens("edac40_tcp", driver)
     assert gone is not None and "Connection refused" in gone.problem
 

@@ -14,22 +14,25 @@ using dm_msgs::msg::ErrorCode;
 
 int main(int argc, char ** argv)
 {
-  rclcpp::init(argc, argv);
+  const auto arguments = rclcpp::init_and_remove_ros_arguments(argc, argv);  // --ros-args and what follows is not ours
   auto node = std::make_shared<rclcpp::Node>("request_focus");
   auto client = rclcpp_action::create_client<MoveFocus>(node, "move_focus");
+
+  MoveFocus::Goal goal;
+  goal.tolerance = 20e-9;  // m, largest predicted Zernike coefficient error that will do
+  goal.request.curvature = 0.02;  // 1/m of the surface, positive = concave
+  if (arguments.size() > 1) {
+    char * end = nullptr;
+    goal.request.curvature = std::strtod(arguments[1].c_str(), &end);
+    if (end == arguments[1].c_str() || *end != '\0') {
+      RCLCPP_ERROR(node->get_logger(), "curvature %s: must be a number, 1/m", arguments[1].c_str());
+      return EXIT_FAILURE;
+    }
+  }
   if (!client->wait_for_action_server(std::chrono::seconds(10))) {
     RCLCPP_ERROR(node->get_logger(), "no action move_focus: is focus_controller running?");
     return EXIT_FAILURE;
   }
-
-  MoveFocus::Goal goal;
-  char * end = nullptr;
-  goal.request.curvature = argc > 1 ? std::strtod(argv[1], &end) : 0.02;  // 1/m of the surface, positive = concave
-  if (argc > 1 && (end == argv[1] || *end != '\0')) {
-    RCLCPP_ERROR(node->get_logger(), "curvature %s: must be a number, 1/m", argv[1]);
-    return EXIT_FAILURE;
-  }
-  goal.tolerance = 20e-9;  // m, largest predicted Zernike coefficient error that will do
 
   auto accepted = client->async_send_goal(goal);
   if (rclcpp::spin_until_future_complete(node, accepted, std::chrono::seconds(5)) != rclcpp::FutureReturnCode::SUCCESS ||

@@ -2,6 +2,7 @@
 // examples/vision_node.py does in Python, see docs/camera.md:
 // ros2 run dm_example_cpp vision_node --ros-args -p rest_distance:=10.0
 
+#include <cstdlib>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -74,6 +75,11 @@ private:
 int main(int argc, char ** argv)
 {
   rclcpp::init(argc, argv);
-  rclcpp::spin(std::make_shared<VisionNode>());
+  try {
+    rclcpp::spin(std::make_shared<VisionNode>());
+  } catch (const std::exception & error) {  // a parameter of another type, or of no distance
+    RCLCPP_ERROR(rclcpp::get_logger("vision"), "%s", error.what());
+    return EXIT_FAILURE;
+  }
   rclcpp::shutdown();
 }

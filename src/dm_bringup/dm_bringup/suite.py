@@ -56,6 +56,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
         values = flat(section["ros__parameters"])
+        _check_readable(f"{path}: {key}", values)
         if "*" in place:  # of every mirror: what a section of its own says counts, as to ROS
             result[name] = values | result.get(name, {})
             continue
@@ -64,6 +65,17 @@ def load_config(path: Path, namespace: str = "") -> Config:
         own.add(name)
         result[name] = result.get(name, {}) | values
     return result
+
+
+def _check_readable(section: str, values: Mapping[str, Any]) -> None:
+    """Raise ConfigError, naming the `section`, for values that ROS does not read."""
+    for name, value in values.items():
+        if value is None:  # written anew it would be `null`, a text to ROS
+            raise ConfigError(f"{section}: {name}: must have a value, or be left out")
+        kinds = {type(item) for item in value} if isinstance(value, list) else set[type]()
+        if len(kinds) > 1 and kinds != {str, float}:  # 1e5 is a text to YAML, and a number to ROS
+            text = 'must be of one type, as 0.0 and 2.5, or "--port" and "12"'
+            raise ConfigError(f"{section}: {name} = {value}: {text}")
 
 
 def flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

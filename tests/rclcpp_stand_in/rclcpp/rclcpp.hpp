@@ -2,6 +2,7 @@
 // warning is throttled. Their rcl needs Python.
 #pragma once
 
+#include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
@@ -48,9 +49,15 @@ inline void init(int argc, char const * const * argv)
   options.discovery_options.automatic_discovery_range = RMW_AUTOMATIC_DISCOVERY_RANGE_LOCALHOST;
   check(rmw_init(&options, &context));
 }
+inline std::vector<std::string> init_and_remove_ros_arguments(int argc, char const * const * argv)
+{
+  init(argc, argv);
+  return {arguments.begin(), std::find(arguments.begin(), arguments.end(), "--ros-args")};
+}
 inline bool shutdown() {return rmw_shutdown(&context) == RMW_RET_OK;}
 
 struct Logger {};
+inline Logger get_logger(const std::string &) {return {};}
 struct Clock {};
 struct QoS
 {

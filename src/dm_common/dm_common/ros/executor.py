@@ -205,7 +205,10 @@ def run_node(make_node: Callable[[], Node]) -> int:
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # whoever started this may have kept them back until now
         remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:  # of rcl: an argument, or a parameter file, that it cannot read
+            raise ValueError(f"{type(error).__name__}: {error}") from error
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals(executor)

@@ -39,7 +39,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
         if node.configuring:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
     # Wrong values are reported already: what is tried goes by the others.
-    sound = {node: _sound(node, values) for node, values in config.items()}
+    sound = {node: sound_values(node, values) for node, values in config.items()}
     yield "aperture of the maps", lambda: aperture_fits(sound)
     driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
@@ -59,7 +59,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
             yield "calibration", lambda: stored_calibration(store, serial, values["updates.stale_after"])
 
 
-def _sound(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def sound_values(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Those of a node's values that are given and allowed."""
     known, problems = _known(node), _problems(node, values)
     return {name: value for name, value in values.items() if name in known and value != UNSET and name not in problems}
@@ -138,8 +138,8 @@ def aperture_fits(config: Config) -> Finding | None:
 
 
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Ports that the bench wants and that others hold; None = all are free."""
-    values, taken = effective("virtual_bench", bench), []
+    """Ports that the bench wants and that others hold; None = all are free. What may not be is none."""
+    values, taken = effective("virtual_bench", sound_values("virtual_bench", bench)), []
     for name, kind in (
         ("electronics.tcp_port", socket.SOCK_STREAM),
         ("electronics.udp_port", socket.SOCK_DGRAM),

@@ -74,7 +74,7 @@ def up(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     from dm_bringup.suite import Suite
-    from dm_tools.doctor.bench import effective, taken_ports
+    from dm_tools.doctor.bench import effective, sound_values, taken_ports
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
@@ -97,7 +97,7 @@ def up(
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
             if kind == "virtual bench":
-                bench = effective("virtual_bench", configuration["virtual_bench"])
+                bench = effective("virtual_bench", sound_values("virtual_bench", configuration["virtual_bench"]))
                 console.print(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
