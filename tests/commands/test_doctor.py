@@ -107,6 +107,7 @@ FLAT = Path(_FOLDER.name) / "flat.dat"
 FLAT.write_bytes(encode_dat(np.zeros((8, 8)), 1e-4, 632.8e-9, 0))
 
 LINE = {"plate.actuator_x": [-0.004, 0.0, 0.004], "plate.actuator_y": [0.0, 0.0, 0.0]}
+SAME_PLACE = {"plate.actuator_x": [-0.004, 0.004, 0.0, 0.0], "plate.actuator_y": [0.0, 0.0, 0.004, 0.004]}
 #: Values that contradict each other: node, what differs from the shipped bench, words of the reason.
 CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("interferometer", {"watch_folder": ""}, "trigger_command needs watch_folder"),
@@ -165,6 +166,7 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("virtual_bench", {"plate.actuators": 20}, "full rings hold 1, 7, 19"),
     ("virtual_bench", {"plate.actuator_x": [0.0]}, "must be as many"),
     ("virtual_bench", {"plate.pitch": 0.01}, "beyond the edge of the plate"),
+    ("virtual_bench", SAME_PLACE | {"wiring": WIRING[:4]}, "actuators 3 and 4 are at the same place"),
     ("virtual_bench", LINE | {"wiring": WIRING[:3]}, "3 actuators on one line cannot hold the plate"),
     ("virtual_bench", {"piezo.law": "preisach", "piezo.hysteresis": 0.3}, "piezo.hysteresis = 0.3"),
     ("virtual_bench", {"interferometer.field_diameter": 0.04}, "must not exceed the mirror"),

@@ -55,8 +55,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
-        values = flat(section["ros__parameters"])
-        _check_readable(f"{path}: {key}", values)
+        values = _readable(f"{path}: {key}", flat(section["ros__parameters"]))
         if "*" in place:  # of every mirror: what a section of its own says counts, as to ROS
             result[name] = values | result.get(name, {})
             continue
@@ -67,15 +66,21 @@ def load_config(path: Path, namespace: str = "") -> Config:
     return result
 
 
-def _check_readable(section: str, values: Mapping[str, Any]) -> None:
-    """Raise ConfigError, naming the `section`, for values that ROS does not read."""
+def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values as ROS reads them, where 1e5 among numbers is one; what it does not read is a ConfigError."""
+    found = dict(values)
     for name, value in values.items():
         if value is None:  # written anew it would be `null`, a text to ROS
             raise ConfigError(f"{section}: {name}: must have a value, or be left out")
         kinds = {type(item) for item in value} if isinstance(value, list) else set[type]()
-        if len(kinds) > 1 and kinds != {str, float}:  # 1e5 is a text to YAML, and a number to ROS
+        if kinds == {str, float}:
+            with contextlib.suppress(ValueError):
+                found[name] = [float(item) for item in value]
+                continue
+        if len(kinds) > 1:
             text = 'must be of one type, as 0.0 and 2.5, or "--port" and "12"'
             raise ConfigError(f"{section}: {name} = {value}: {text}")
+    return found
 
 
 def flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -55,14 +55,21 @@ def test_texts_stay_texts_on_their_way_to_the_nodes(tmp_path: Path, text: str) -
         ("~", "must have a value"),
         ("[0, 0.5]", "of one type"),
         ('["--port", 12]', "of one type"),
+        ('["--port", 0.5]', "of one type"),
     ],
 )
 def test_values_that_ros_does_not_read_are_named(tmp_path: Path, value: str, said: str) -> None:
     """`null` would be a text to ROS: a mirror of that serial."""
     file = tmp_path / "config.yaml"
-    file.write_text(f"/**/pdm_driver:\n  ros__parameters:\n    mirror.serial: {value}\n    good: [1e5, 0.5]\n")
+    file.write_text(f"/**/pdm_driver:\n  ros__parameters:\n    mirror.serial: {value}\n")
     with pytest.raises(ConfigError, match=rf"config\.yaml: /\*\*/pdm_driver: mirror\.serial.*{said}"):
         load_config(file)
+
+
+def test_numbers_that_yaml_takes_for_texts_stay_numbers_in_lists(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("/**/pdm_driver:\n  ros__parameters:\n    limits: [1e5, 0.5]\n")
+    assert load_config(file) == {"pdm_driver": {"limits": [1e5, 0.5]}}
 
 
 def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: Path) -> None:

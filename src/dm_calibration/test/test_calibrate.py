@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,6 +94,7 @@ def test_a_folder_of_maps_whose_names_end_in_capitals(tmp_path: Path) -> None:
     (tmp_path / "1.4D").write_bytes(four_d_bytes(seen(plant, inside, commands)[0] / 632.8e-9))
     outcome = outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS))
     assert [Path(record.file).name for record in outcome.records] == ["1.4D"]
+    assert abs(outcome.records[0].stamp_ns - time.time_ns()) < 600e9  # a calibration of 1970 would be stale at once
     # Such a file does not tell its time, and a copy of it was written when it was copied.
     with pytest.raises(ValueError, match="times: hysteresis and creep"):
         outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS), True)

@@ -181,40 +181,45 @@ class Connection:
         Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel it, so that the mirror is left safe;
         `identity`: see `run_goal`.
         """
-        failed: list[Exception] = []
+        server, failed = self._servers.get(name), list[Exception]()
 
         def take(feedback: Any) -> None:
-            self._servers[name].heard()  # who speaks lives, even if this process missed that on a busy machine
+            if server is not None:
+                server.heard()  # who speaks lives, even if this process missed that on a busy machine
             try:
-                on_feedback(feedback)
+                if not failed:
+                    on_feedback(feedback)
             except Exception as error:  # in the executor it would end the whole process
                 failed.append(error)
 
-        with self._answered(name) as gone:
-            result = run_goal(
-                self.clients[name],
-                goal,
-                timeout_s,
-                answer_s=self._timeout_s,
-                on_feedback=take,
-                stop=lambda: bool(failed) or stop(),
-                gone=gone,
-                identity=identity,
-            )
-        if failed:
-            raise failed[0]
+        try:
+            with self._answered(name) as gone:
+                result = run_goal(
+                    self.clients[name],
+                    goal,
+                    timeout_s,
+                    answer_s=self._timeout_s,
+                    on_feedback=take,
+                    stop=lambda: bool(failed) or stop(),
+                    gone=gone,
+                    identity=identity,
+                )
+        finally:
+            if failed:
+                raise failed[0]
         return checked(result)
 
     @contextmanager
     def _answered(self, name: str) -> Iterator[Callable[[], str]]:
         """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
-        server = self._servers[name]
-        server.wait_for_return()
-        gone = server.since_now()
+        server = self._servers.get(name)  # None of a client that its user has added
+        if server is not None:
+            server.wait_for_return()
+        gone = server.since_now() if server is not None else lambda: ""
         try:
             yield gone
         except ServiceCallError as error:
             code, text = error.error_code, str(error)
-            if lost := gone():
+            if server is not None and (lost := gone()):
                 code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost}"
             raise DeformableMirrorError(code, text) from error

@@ -72,13 +72,14 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest
     def run_goal(*_arguments: object, on_feedback: Any, stop: Any, **_options: object) -> Converge.Result:
         cancelled.append(stop())
         on_feedback("step 1")
+        on_feedback("step 2")
         cancelled.append(stop())
         return Converge.Result(error_code=ErrorCode.CANCELED)
 
-    def fail(_feedback: object) -> None:
-        raise ZeroDivisionError("mine")
+    def fail(feedback: object) -> None:
+        raise ZeroDivisionError(feedback)
 
     monkeypatch.setattr(connection, "run_goal", run_goal)
-    with pytest.raises(ZeroDivisionError, match="mine"):
+    with pytest.raises(ZeroDivisionError, match="step 1"):
         asked.run_action("converge", Converge.Goal(), fail, 1.0)
     assert cancelled == [False, True]

@@ -70,7 +70,7 @@ def test_a_signal_that_comes_before_the_node_is_made_ends_it_in_order(domain: in
 
 
 @pytest.mark.parametrize("options", [["--params-file", "mixed.yaml"], ["--log-level", "loud"], ["--no-such"]])
-def test_options_that_ros_cannot_read_are_refused_in_one_line(domain: int, tmp_path: Path, options: list[str]) -> None:
+def test_options_that_ros_cannot_read_leave_no_traceback(domain: int, tmp_path: Path, options: list[str]) -> None:
     (tmp_path / "careful.py").write_text(NODE_SCRIPT)
     (tmp_path / "mixed.yaml").write_text("careful: {ros__parameters: {places: [0, 0.5]}}\n")
     command = [sys.executable, "careful.py", "--ros-args", *options]

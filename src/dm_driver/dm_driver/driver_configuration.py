@@ -128,8 +128,13 @@ def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.fl
     x = np.array(values["mirror.actuator_x"], dtype=np.float64)
     y = np.array(values["mirror.actuator_y"], dtype=np.float64)
     if x.size == 0 and y.size == 0:
-        pattern = (values[f"mirror.{name}"] for name in ("pitch", "start_angle", "clockwise", "reflected"))
-        return hexagonal_positions(actuators, *pattern)
+        return hexagonal_positions(
+            actuators,
+            values["mirror.pitch"],
+            values["mirror.start_angle"],
+            values["mirror.clockwise"],
+            values["mirror.reflected"],
+        )
     for name, ordinates in (("mirror.actuator_x", x), ("mirror.actuator_y", y)):
         if ordinates.size != actuators:
             raise ValueError(

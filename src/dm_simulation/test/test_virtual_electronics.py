@@ -194,12 +194,18 @@ class ServedUnit:
         self.unit = DriveUnit(DriveConfig())
         self.updates = 0
         self.events: list[str] = []
+        self.severe: list[str] = []
         self.link = folder / "ttyDAC40"
         ports = PortsConfig(0, 0, 0, str(self.link))
-        self.server = ElectronicsServer(self.unit, ports, self.count, lambda severe, text: self.events.append(text))
+        self.server = ElectronicsServer(self.unit, ports, self.count, self.take)
 
     def count(self) -> None:
         self.updates += 1
+
+    def take(self, severe: bool, text: str) -> None:
+        self.events.append(text)
+        if severe:
+            self.severe.append(text)
 
     def port(self, name: str) -> int:
         return int(self.server.endpoints[name])
@@ -281,7 +287,8 @@ def test_malformed_frames_are_recorded_and_change_nothing(bench: ServedUnit) -> 
         wait_until(lambda: bench.updates == 1)
         client.sendall(edac40_all(10)[:50])
     wait_until(lambda: bench.server.malformed_count == 2)
-    first, second = (event for event in bench.events if event.startswith("malformed"))
+    first, second = bench.severe
+    assert first.startswith("malformed") and "TCP client connected" in bench.events
     assert "unknown EDAC40 command 9" in first and "inside a frame" in second
     assert bench.codes() == [9] * 40
 

@@ -1,5 +1,6 @@
 """Maps that were not measured by a run of this suite: files, arrays or measurements, with the commands they show."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from dm_common.mirror import Mirror
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
-#: Least time that stamps in ns do not hold, s.
+#: Times lie within this, s: stamps are int64 numbers of ns.
 TIME_MAX_S = 9e9
 
 #: Endings of the map files that are taken from a folder, in small letters; those of files may be in capitals.
@@ -41,7 +42,7 @@ def outcome_of(
     """The maps as if a run had measured them, in their order; the files of a folder in that of their names.
 
     Args and errors as of :func:`~dm_calibration.calibrator.calibrate`. Where neither `times` nor the files tell when
-    maps were taken, they count as one second apart.
+    all maps were taken, they count as one second apart, the last as just now.
     """
     measured = _measured(maps, settings or IngestSettings(aperture_radius=mirror.working_radius))
     count = len(measured)
@@ -56,14 +57,15 @@ def outcome_of(
         taken = np.asarray(times, dtype=np.float64)
         if taken.shape != (count,) or not (np.abs(taken) < TIME_MAX_S).all():
             raise ValueError(
-                f"times has the shape {taken.shape} and goes up to {taken.max(initial=0.0):g}: must be ({count},) "
-                "finite numbers, s"
+                f"times has the shape {taken.shape} and goes up to {np.abs(taken).max(initial=0.0):g}: must be "
+                f"({count},) numbers of s, not of ns, within {TIME_MAX_S:g}"
             )
         measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
     elif not all(one.stamp_ns for one in measured):
         if hysteresis:
             raise ValueError("times: hysteresis and creep cannot be told apart without; give s, one for each map")
-        measured = [replace(one, stamp_ns=number * 10**9) for number, one in enumerate(measured)]
+        last = time.time_ns()
+        measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
     if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
         raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
     outcome = Outcome()

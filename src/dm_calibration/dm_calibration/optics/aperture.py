@@ -100,6 +100,7 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
         far = circle.radius_px > math.hypot(*region.shape)  # a slanted edge, which is no rim
         if not far and scatter <= _ROUND * circle.radius_px:
             disc = circle.disc(region.shape)
+            # It covers about the same pixels.
             if np.count_nonzero(disc & region) >= 0.8 * np.count_nonzero(disc | region):
                 return circle
     circle = _inscribed_circle(region)

@@ -23,8 +23,13 @@ NM, MM = 1e9, 1e3
 PIXELS = 61
 #: Small maps in a row.
 COLUMNS = 7
-#: A degauss, the last kind, has no map.
-KIND_COLOURS: dict[str, str] = dict(zip(StepKind, (GREY, BLUE, GREEN, ORANGE, SKY_BLUE, PURPLE, YELLOW), strict=False))
+KIND_COLOURS: dict[str, str] = dict(
+    zip(
+        [kind for kind in StepKind if kind is not StepKind.DEGAUSS],  # which has no map
+        (GREY, BLUE, GREEN, ORANGE, SKY_BLUE, PURPLE, YELLOW),
+        strict=True,
+    )
+)
 
 
 def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:

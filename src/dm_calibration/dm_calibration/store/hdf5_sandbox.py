@@ -152,5 +152,5 @@ class Hdf5Sandbox:
         return f"reading it ended the helper process with status {status}"
 
 
-#: Of the one helper of this process.
+#: :meth:`Hdf5Sandbox.read` by the one helper of this process.
 read_in_sandbox = Hdf5Sandbox().read

@@ -87,7 +87,7 @@ class HysteresisTracker:
         if not report.history_known:
             # Without a link, nobody knows whether the outputs held: the unit may have had no power.
             since = self._seen if report.linked and not last.linked else report.time
-            reason = "writes were lost, or a degauss was left or too small"
+            reason = "writes were lost, or a degauss was left, too short or too small"
             self._guess_keeping_creep(report, self.unknown or reason, since)
             return
         if (missed := report.turns - last.turns - 1) > 0:

@@ -208,7 +208,7 @@ def run_node(make_node: Callable[[], Node]) -> int:
         try:
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:  # of rcl: an argument, or a parameter file, that it cannot read
-            raise ValueError(f"{type(error).__name__}: {error}") from error
+            raise ValueError(str(error)) from error
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals(executor)

@@ -14,7 +14,7 @@ from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
-from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns, taken
+from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
@@ -169,15 +169,19 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
             raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")
         return values.reshape(rows, actuators)
 
-    names = ("zernike_offset", "sample_x", "sample_y", "sample_weight", "sag_offset")
-    vectors: dict[str, Any] = {name: np.asarray(getattr(calibration, name), dtype=float) for name in names}
     return InfluenceModel(
+        aperture_radius=calibration.aperture_radius,
         influence_zernike=matrix("influence_zernike", len(calibration.zernike_offset)),
+        zernike_offset=np.asarray(calibration.zernike_offset, dtype=float),
+        sample_x=np.asarray(calibration.sample_x, dtype=float),
+        sample_y=np.asarray(calibration.sample_y, dtype=float),
+        sample_weight=np.asarray(calibration.sample_weight, dtype=float),
         influence_sag=matrix("influence_sag", len(calibration.sag_offset)),
+        sag_offset=np.asarray(calibration.sag_offset, dtype=float),
+        held_out_rms=calibration.held_out_rms,
+        held_out_max_zernike=calibration.held_out_max_zernike,
         actuator_x=actuator_x,
         actuator_y=actuator_y,
-        **taken(calibration, "aperture_radius", "held_out_rms", "held_out_max_zernike"),
-        **vectors,
     )
 
 

@@ -80,9 +80,10 @@ def neighbour_pairs(x: Array, y: Array) -> NDArray[np.intp]:
     distance = np.hypot(x[:, None] - x, y[:, None] - y)
     first, second = np.triu_indices(len(x), k=1)
     apart = distance[first, second]
-    if not apart.min() > 0:
-        pair = first[apart.argmin()] + 1, second[apart.argmin()] + 1
-        raise ValueError("plate.actuator_x and _y: actuators {} and {} are at the same place".format(*pair))
+    nearest = apart.argmin()
+    if not apart[nearest] > 0:
+        pair = f"{first[nearest] + 1} and {second[nearest] + 1}"
+        raise ValueError(f"plate.actuator_x and _y: actuators {pair} are at the same place")
     near = apart < 1.2 * apart.min()
     return np.stack([first[near], second[near]], axis=1)
 

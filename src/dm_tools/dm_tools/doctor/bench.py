@@ -138,8 +138,9 @@ def aperture_fits(config: Config) -> Finding | None:
 
 
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Ports that the bench wants and that others hold; None = all are free. What may not be is none."""
-    values, taken = effective("virtual_bench", sound_values("virtual_bench", bench)), []
+    """Ports that the bench wants and that others hold; None = all are free. A wrong value is passed over."""
+    sound, taken = sound_values("virtual_bench", bench), []
+    values = effective("virtual_bench", sound)
     for name, kind in (
         ("electronics.tcp_port", socket.SOCK_STREAM),
         ("electronics.udp_port", socket.SOCK_DGRAM),
@@ -147,7 +148,7 @@ def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
         ("trigger.port", socket.SOCK_STREAM),
     ):
         port = values[name]
-        if port <= 0:
+        if port <= 0 or (name in bench and name not in sound):
             continue
         with socket.socket(socket.AF_INET, kind) as probe:
             if kind == socket.SOCK_STREAM:

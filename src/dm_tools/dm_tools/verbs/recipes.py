@@ -68,7 +68,7 @@ def next_of(book: Any) -> str:
         return "requests with `mode: conditioned`, or with a time budget, use them (docs/recipes.md)"
     if not book.calibration_id:
         return "./dm calibrate"
-    return "./dm check: recipes are back once a map agrees" if book.degauss_steps else "./dm recipes builds some"
+    return "./dm check shows why (docs/stay-true.md)" if book.degauss_steps else "./dm recipes builds some"
 
 
 def recipes(
@@ -126,7 +126,7 @@ def recipes(
     if not book.calibration_id:
         console.print("no calibration is in use")
     elif not book.recipes:
-        none = "withholds its recipes: maps disagree" if book.degauss_steps else "holds no recipes"
-        console.print(f"calibration {book.calibration_id} {none}")
+        withheld = "withholds its recipes: maps disagree, or an actuator does not follow"
+        console.print(f"calibration {book.calibration_id} {withheld if book.degauss_steps else 'holds no recipes'}")
     write_json(json, {"calibration": book.calibration_id, **_figures(book)})
     next_step(next_of(book))
