@@ -22,7 +22,7 @@ from rcl_interfaces.msg import Log
 from dm_client.connection import Connection
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
-from dm_common.ros.clients import call
+from dm_common.ros.clients import ThreadedActionClient, call
 from studies.documentation.answer_cases import CASES
 from studies.documentation.special_cases import BENCH, HELD, HOLD, MAP, TOPICS
 from studies.documentation.state_answers import SHOWN, Nodes
@@ -111,9 +111,14 @@ class Asker(Connection):
     """Calls every interface, see `Connection`."""
 
     def __init__(self, domain: int | None) -> None:
-        interfaces = {name: kind for name, (kind, _) in (CASES | BENCH).items() if name not in ANSWERED_ON}
         topics = {topic: (kind, qos.STATE) for topic, kind in ANSWERED_ON.values()}
-        super().__init__("answers", "", domain, topics, interfaces, timeout_s=60.0)
+        super().__init__("answers", "", domain, topics, {}, timeout_s=60.0)
+        node = self.node
+        for name, (kind, _) in (CASES | BENCH).items():
+            if hasattr(kind, "Goal"):
+                self.clients[name] = ThreadedActionClient(node, kind, name)
+            elif name not in ANSWERED_ON:
+                self.clients[name] = node.create_client(kind, name)
         self._publishers = {name: self.node.create_publisher(CASES[name][0], name, qos.COMMAND) for name in ANSWERED_ON}
         self._log: list[Log] = []
         self.node.create_subscription(Log, "/rosout", self._log.append, 1000)

@@ -86,6 +86,13 @@ class Node
 public:
   explicit Node(const std::string & name)
   : handle_(check(rmw_create_node(&context, name.c_str(), "/"))) {}
+  Node(const Node &) = delete;
+  ~Node()  // else its threads outlive what Fast DDS tears down after main()
+  {
+    if (rmw_destroy_node(handle_) != RMW_RET_OK) {
+      std::fprintf(stderr, "the node cannot be destroyed: %s\n", rmw_get_error_string().str);
+    }
+  }
   Logger get_logger() const {return {};}
   std::shared_ptr<Clock> get_clock() const {return std::make_shared<Clock>();}
   double declare_parameter(const std::string & name, double value) const

@@ -68,7 +68,7 @@ def next_of(book: Any) -> str:
         return "requests with `mode: conditioned`, or with a time budget, use them (docs/recipes.md)"
     if not book.calibration_id:
         return "./dm calibrate"
-    return "./dm check shows why (docs/stay-true.md)" if book.degauss_steps else "./dm recipes builds some"
+    return "./dm check shows why (docs/stay-true.md)" if book.degauss_steps else "./dm recipes"
 
 
 def recipes(
