@@ -161,8 +161,8 @@ class FocusProbe:
         answer, driver = self.answer, self._driver
         if answer is None or driver is None or not answer.applied:
             return
-        wanted = np.asarray(answer.signals)
-        reached = len(driver.requested) == len(wanted) and bool(np.allclose(driver.requested, wanted, atol=1e-9))
+        wanted, requested = np.asarray(answer.signals), np.asarray(driver.requested)
+        reached = wanted.size == requested.size and float(np.abs(wanted - requested).max(initial=0.0)) <= 1e-9
         self._gate.written(seconds(driver.header.stamp), driver.moving, reached)
 
     # --- moving and measuring ---

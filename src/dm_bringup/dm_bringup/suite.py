@@ -46,16 +46,19 @@ def load_config(path: Path, namespace: str = "") -> Config:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
     result: Config = {}
-    own = set[str]()
+    own, of_all = set[str](), dict[str, Any]()
     for key, section in content.items():
         place, _, name = str(key).rpartition("/")
-        if namespace and "*" not in place and place.strip("/") not in ("", namespace):
+        if namespace and place.partition("*")[0].strip("/") not in ("", namespace):
             continue
-        if name not in NAMES:
+        if name not in NAMES and name != "**":
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
         values = _readable(f"{path}: {key}", flat(section["ros__parameters"]))
+        if name == "**":
+            of_all |= values
+            continue
         if "*" in place:  # of every mirror: what a section of its own says counts, as to ROS
             result[name] = values | result.get(name, {})
             continue
@@ -63,7 +66,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
             raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or chosen by --namespace")
         own.add(name)
         result[name] = result.get(name, {}) | values
-    return result
+    return {name: of_all | values for name, values in result.items()}
 
 
 def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
