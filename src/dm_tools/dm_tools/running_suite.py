@@ -127,7 +127,8 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
         yield
     except DeformableMirrorError as error:
         if error.error_code in (ErrorCode.BUSY, ErrorCode.NOT_CALIBRATED) and (by := holder(client)):
-            text = f"{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
+            none = "no calibration is in use yet; " if error.error_code == ErrorCode.NOT_CALIBRATED else ""
+            text = f"{none}{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
             # The same action takes one goal at a time, and without a calibration nothing else is possible yet.
             if error.response is not None and error.error_code == ErrorCode.BUSY:
                 text += ", or end it with --take-over"
