@@ -3,7 +3,6 @@
 The latest command wins. A move is cut into steps by the safety limiter and written by `dm_driver.writer_thread`.
 """
 
-import logging
 import time
 
 from dm_common.errors import ErrorCode, Refusal
@@ -26,44 +25,31 @@ class ActuatorWriter(WriterThread):
     def enable(self, timeout_s: float) -> bool:
         """Allow writes; the mirror goes to the safe shape first. Returns whether it got there within `timeout_s`.
 
-        No unit can be read back. The way begins at what was written last, by this object or as `last` recorded it: that
-        shape is written again, then the ramp follows. When nothing is known, there is nothing to ramp from and the safe
-        shape is written in one step. Without a link this happens as soon as the link stands, and a link that is lost on
-        the way only delays it; an accepted command takes its place.
+        No unit can be read back. The way begins at what was written last, by this object or as `last` recorded it of
+        another: that shape is written again, then the ramp follows. When nothing is known, there is nothing to ramp
+        from and the safe shape is written in one step. Without a link this happens as soon as the link stands, and a
+        link that is lost on the way only delays it; an accepted command takes its place.
         """
-        known = self._known_shape()
         move: Move | None = None
         with self._change:
+            known = self._last.known(self._shape, self._output.scale, self._limiter)
+            start = self._safe_shape if known is None else known
             self._enabled = self._accepting = self._rewrite_due = True
-            self._shape = self._queue.requested = self._safe_shape if known is None else known
+            self._shape = self._queue.requested = start
             self._sequence = 0
             self._queue.forget_history()
-            if known is not None and largest_change(known, self._safe_shape) > 0.0:
+            if largest_change(start, self._safe_shape) > 0.0:
                 move = Move(Kind.SAFE, self._safe_shape)
                 self._put(move)
             self._change.notify_all()
             written = self._change.wait_for(lambda: not self._rewrite_due, timeout_s)
         if move is None or not written:
             return written
-        assert known is not None
-        limit = time.monotonic() + timeout_s + self._limiter.ramp_time(known, self._safe_shape)
+        limit = time.monotonic() + timeout_s + self._limiter.ramp_time(start, self._safe_shape)
         # Without a link nobody waits for what goes on when it is back.
         while (outcome := move.wait(0.02)) is None and self._link_up and time.monotonic() < limit:
             pass
         return outcome in _UNDER_CONTROL  # a command that came meanwhile is as good: the way to it is a ramp too
-
-    def _known_shape(self) -> Shape | None:
-        """Where the outputs stand, as far as anybody can know; None = unknown."""
-        with self._change:
-            if self._applied is not None:
-                return self._shape
-        recorded = self._last.load()
-        try:
-            if recorded is not None:
-                return self._limiter.check_shape(self._output.scale.signals_of_codes(recorded), "what was sent last")
-        except Refusal as refusal:  # the limits have changed: no legal way begins there
-            logging.getLogger(__name__).warning("the first shape is written in one step: %s", refusal)
-        return None
 
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.
@@ -125,12 +111,16 @@ class ActuatorWriter(WriterThread):
                 return None
             return self.command(shape)
 
-    def turn_back(self, move: Move) -> Move | None:
-        """Leave `move` for the shape that was requested before it; None = something else was asked for since."""
+    def turn_back(self, move: Move, halt: bool = False) -> Move | None:
+        """Leave `move` for the shape that was requested before it, with `halt` for that in which the mirror is.
+
+        Returns the way there; None = something else was asked for since.
+        """
         with self._change:
-            if self._queue.newest is not move or move.before is None:
+            target = self._shape if halt else move.before
+            if self._queue.newest is not move or target is None:
                 return None
-            back = Move(Kind.COMMAND, move.before)
+            back = Move(Kind.COMMAND, target)
             self._watchdog.feed(time.monotonic())
             self._put(back)
             return back

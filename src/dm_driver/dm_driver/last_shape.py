@@ -9,6 +9,7 @@ Two slots are written in turn, each with a check sum, so that one is whole at an
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
 """
 
+import logging
 import os
 import re
 import struct
@@ -17,7 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dm_driver.safety_limiter import Shape
+from dm_common.errors import Refusal
+from dm_driver.output.volts import VoltScale
+from dm_driver.safety_limiter import SafetyLimiter, Shape
 
 _HEAD = struct.Struct("<8sQI")  # magic, number of the write, actuators
 _CHECK = struct.Struct("<I")
@@ -45,15 +48,29 @@ class LastShape:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
 
     def load(self) -> Shape | None:
-        """(N,) codes, the newest whole record; None when there is none for this number of actuators."""
+        """(N,) codes, the newest whole record; None when there is none for this number of actuators, or when it was
+        noted or loaded by this object before.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
         if self._descriptor < 0:
             return None
         newest = None
         for at in (0, self._slot):
             number, shape = self._parse(os.pread(self._descriptor, self._slot, at))
-            if shape is not None and number >= self._number:
+            if shape is not None and number > self._number:
                 self._number, newest = number, shape
         return newest
+
+    def known(self, own: Shape | None, scale: VoltScale, limiter: SafetyLimiter) -> Shape | None:
+        """(N,) where the outputs stand: as another driver left them since, else `own`; None = unknown."""
+        try:
+            if (codes := self.load()) is not None:
+                return limiter.check_shape(scale.signals_of_codes(codes), "what was sent last")
+        except (OSError, Refusal) as error:  # the limits have changed: no legal way begins there
+            logging.getLogger(__name__).warning("the first shape is written in one step: %s", error)
+        return own
 
     def note(self, codes: Shape) -> None:
         """Record `codes` (N,) as what is about to be sent.

@@ -2,7 +2,8 @@
 
 It writes one step of the current move after the other, paced so that the slew rate holds, and leaves a move at once for
 a newer one. After a lost link it tries to reconnect once a second, then writes the last shape again and goes on to the
-safe shape where it was on its way there.
+safe shape where it was on its way there. Where another driver had the unit meanwhile, it begins where that
+one ended, and goes to the safe shape.
 """
 
 import logging
@@ -181,9 +182,13 @@ class WriterThread:
         self._retry_at = time.monotonic() + RECONNECT_PERIOD_S
         self._electronics.open()
         if self._rewrite_due:
+            self._confirm()  # first, for what is sent is recorded: a busy unit stands where its own driver puts it
+            with self._change:
+                own, self._shape = self._shape, self._last.known(self._shape, self._output.scale, self._limiter)
+                if self._shape is not own and self._rewrite_due and self._queue.newest is None:
+                    self._put(Move(Kind.SAFE, self._safe_shape))
             self._rewrite()
-        time.sleep(CONFIRM_S)
-        self._electronics.check()
+        self._confirm()
         with self._change:
             self._link_up = True
             self.counters.reconnects += self._was_up
@@ -192,6 +197,10 @@ class WriterThread:
             self._check_at = time.monotonic() + CHECK_PERIOD_S
             self._change.notify_all()
         self._publish(True)
+
+    def _confirm(self) -> None:
+        time.sleep(CONFIRM_S)
+        self._electronics.check()
 
     def _rewrite(self) -> None:
         """Write the last shape (after `enable` the safe one) in one step; what stands at the outputs is unknown."""

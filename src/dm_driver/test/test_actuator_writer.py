@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -278,6 +278,18 @@ def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(un
         assert writer.turn_back(move) is None and newer.wait(5) is Outcome.REACHED
 
 
+def test_a_degauss_that_halts_swings_no_more(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=10.0) as (writer, _):
+        move = degauss(writer, 1.0, 20, shape(0.0))
+        wait_until(lambda: len(unit.frames) > 10)
+        there = writer.turn_back(move, halt=True)
+        assert there is not None and there.wait(5) is Outcome.REACHED and move.wait(5) is Outcome.SUPERSEDED
+        wait_until(lambda: len(unit.frames) == writer.state().sequence)
+        seen = signals_of(unit.frames)
+        assert np.abs(seen[-1] - seen[-2]).max() <= CODE
+        assert writer.state().moving is None and writer.turn_back(move, halt=True) is None
+
+
 def test_a_degauss_is_bounded() -> None:
     with pytest.raises(
         Refusal, match=r"steps = 9000: would take 450 s at limits.slew_rate = 20 1/s, must be at most 180 s"
@@ -387,10 +399,12 @@ def ramp_to_safe_shape(unit: Edac40TcpUnit, begins_at: float, since: int = 0) ->
 
 
 def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpUnit, tmp_path: Path) -> None:
-    last = LastShape(tmp_path / "unit.shape", 37)
-    last.note(replace(SCALE, volts_max=400.0).exact_codes(shape(0.35)))  # 270 V, by a driver that was killed
+    path = tmp_path / "unit.shape"
+    LastShape(path, 37).note(
+        replace(SCALE, volts_max=400.0).exact_codes(shape(0.35))
+    )  # 270 V, by a driver that was killed
     unit.unplug()
-    with started_writer(unit, electronics=Counting, last=last) as (writer, _told):
+    with started_writer(unit, electronics=Counting, last=LastShape(path, 37)) as (writer, _told):
         assert not writer.enable(0.0)
         fail_to_connect(writer)
         assert writer.state().moving is None
@@ -410,9 +424,9 @@ def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpU
 @pytest.mark.parametrize("commanded", [False, True])
 def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path: Path, commanded: bool) -> None:
     """The way goes on, unless an accepted command took its place: then the shape stays where the link was lost."""
-    last = LastShape(tmp_path / "unit.shape", 37)
-    last.note(SCALE.exact_codes(shape(0.8)))
-    with started_writer(unit, slew_rate=1.0, last=last) as (writer, _told):
+    path = tmp_path / "unit.shape"
+    LastShape(path, 37).note(SCALE.exact_codes(shape(0.8)))
+    with started_writer(unit, slew_rate=1.0, last=LastShape(path, 37)) as (writer, _told):
         assert writer.wait_for_link(5)
         writer.enable(0.0)
         wait_until(lambda: len(unit.frames) > 2)
@@ -430,6 +444,38 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
             assert writer.state().moving is None
             wait_until(lambda: len(unit.frames) > frames)
             assert signals_of(unit.frames[-1:]) == pytest.approx(lost.applied[0], abs=CODE)
+
+
+@pytest.mark.parametrize("had_it_before", [True, False])
+def test_a_driver_that_waited_for_the_unit_begins_where_the_other_one_ended(
+    unit: Edac40TcpUnit, tmp_path: Path, had_it_before: bool
+) -> None:
+    path = tmp_path / "unit.shape"
+    with ExitStack() as waiting:
+
+        def start() -> ActuatorWriter:
+            return waiting.enter_context(started_writer(unit, last=LastShape(path, 37)))[0]
+
+        if had_it_before:
+            second = start()
+            assert second.wait_for_link(5) and second.enable(5)
+            assert second.command(shape(0.2)).wait(5) is Outcome.REACHED
+            unit.drop_client()
+            wait_until(lambda: not second.state().link_up)
+        with running_writer(unit, last=LastShape(path, 37)) as (first, _):
+            if not had_it_before:
+                second = start()
+                assert not second.enable(0.0)
+            assert first.command(shape(0.8)).wait(5) is Outcome.REACHED
+            time.sleep(2.5)  # it tries once a second
+            assert not second.state().link_up
+            recorded = LastShape(path, 37).load()
+            assert recorded is not None and SCALE.signals_of_codes(recorded) == pytest.approx(0.8)
+        assert second.wait_for_link(5)
+        wait_until(lambda: second.state().moving is None and second.state().applied is not None)
+    seen = signals_of(unit.frames)
+    assert np.abs(np.diff(seen, axis=0)).max() <= 0.1 + CODE
+    assert seen[-1] == pytest.approx(-1.0, abs=CODE)
 
 
 def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40TcpUnit) -> None:

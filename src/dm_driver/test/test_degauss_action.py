@@ -18,11 +18,12 @@ class Writer:
     """Its degauss ends as soon as it is to be left for another move."""
 
     def __init__(self, end: Outcome) -> None:
-        self.end, self.turned_back, self.begun = end, False, False
+        self.end, self.turned_back, self.halted, self.begun = end, False, False, False
 
-    def turn_back(self, move: Move) -> None:
-        self.turned_back = True
+    def turn_back(self, move: Move, halt: bool) -> Move | None:
+        self.turned_back, self.halted = not halt, halt
         move.finish(self.end)
+        return move if halt else None
 
 
 @pytest.fixture
@@ -76,4 +77,4 @@ def test_who_lost_the_mirror_does_not_move_it_by_a_cancel(hold: MirrorHold, monk
     writer = Writer(Outcome.REACHED)
     outcome, code, text = carried_out(hold, writer, monkeypatch)
     assert (outcome, code) == ("canceled", ErrorCode.CANCELED) and "operator" in text
-    assert not writer.turned_back
+    assert writer.halted and not writer.turned_back

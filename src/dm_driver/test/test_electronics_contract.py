@@ -187,6 +187,13 @@ def test_what_a_makers_library_raises_breaks_the_link(monkeypatch: pytest.Monkey
         assert not electronics.is_open
 
 
+@pytest.mark.parametrize("kind", ["edac40_tcp", "edac40_udp"])
+@pytest.mark.parametrize("address", ["10.0.0.5:1234", "socket://10.0.0.5", "10.0.0.5/24", "fe80::1", " 10.0.0.5"])
+def test_an_address_holds_no_port_and_nothing_else(kind: str, address: str) -> None:
+    with pytest.raises(ValueError, match=r"host name or IPv4 address; its port is electronics.port"):
+        BACK_ENDS[kind](ElectronicsSettings(address))
+
+
 def test_tcp_notices_between_writes_that_the_unit_closed() -> None:
     with Edac40TcpUnit() as unit:
         electronics = BACK_ENDS["edac40_tcp"](settings_of(unit))

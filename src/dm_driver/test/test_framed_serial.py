@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 import select
+import termios
 import threading
 import time
 import tty
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import serial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -189,6 +192,15 @@ CODES = np.arange(4, dtype=np.uint16)
 def of_four(line: tuple[int, str], timeout_s: float = 1.0, **format: Any) -> FramedSerial:
     """The unit of four channels at the line, with some of its frame otherwise."""
     return FramedSerial(ElectronicsSettings(serial_port=line[1], frame=replace(FOUR, **format), timeout_s=timeout_s))
+
+
+@pytest.mark.parametrize("error", [termios.error(22, "Invalid argument"), ValueError("Failed to set custom baud rate")])
+def test_a_port_without_the_parity_or_speed_is_no_defect(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(serial, "Serial", Mock(side_effect=error))
+    with pytest.raises(LinkError, match=rf"cannot open framed serial unit at /dev/pts/\d+: .*{error.args[-1]}"):
+        of_four(line).open()
 
 
 def test_a_missing_answer_breaks_the_link(line: tuple[int, str]) -> None:

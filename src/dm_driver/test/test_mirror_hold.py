@@ -90,6 +90,20 @@ def test_who_lost_it_does_not_get_it_back_by_renewing(hold: MirrorHold) -> None:
         hold.ask(Operation.RENEW, "calibration")
 
 
+@pytest.mark.parametrize("way", ["release", "command"])
+def test_who_lost_it_is_heard_again_after_giving_it_back_or_taking_it(hold: MirrorHold, way: str) -> None:
+    hold.ask(Operation.TAKE_OVER, "operator")
+    with refused(ErrorCode.PREEMPTED):
+        hold.check("calibration", take_over=False)
+    if way == "release":
+        hold.ask(Operation.RELEASE, "operator")
+        hold.ask(Operation.RELEASE, "calibration")
+    else:
+        assert hold.check("calibration", take_over=True)
+        hold.evict("calibration")
+    assert not hold.check("calibration", take_over=False)
+
+
 def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) -> None:
     hold = MirrorHold(clock)
     hold.ask(Operation.RENEW, "calibration")

@@ -97,18 +97,21 @@ class DegaussAction:
         return "succeed", ErrorCode.OK, swings if move.wipes else swings + too_little
 
     def _slew_back(self, writer: ActuatorWriter, move: Move, holder: str) -> str:
-        """Leave a degauss for the shape that the mirror held before.
+        """Leave a degauss for the shape that the mirror held before; for none where the mirror is somebody else's now.
 
         Returns what became of it; "" = the degauss had ended by itself.
         """
+        lost = ""
         try:
             self._gate.hold.check(holder, take_over=False)
         except Refusal as refusal:
-            return f"cancelled; the mirror is not slewed back, for it is somebody else's: {refusal}"
-        back = writer.turn_back(move)
+            lost = str(refusal)
+        back = writer.turn_back(move, halt=bool(lost))
         if back is None:
             superseded = move.wait(MARGIN_S) in (None, Outcome.SUPERSEDED)
             return "cancelled; the mirror follows a newer command" if superseded else ""
+        if lost:
+            return f"cancelled; the mirror halts and is not slewed back, for it is somebody else's: {lost}"
         ended = back.wait(writer.ramp_time(back.target) + MARGIN_S)
         if ended is Outcome.REACHED:
             return "cancelled; the mirror is back in the shape it held before, its history is not known"

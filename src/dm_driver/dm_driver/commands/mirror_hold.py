@@ -76,6 +76,7 @@ class MirrorHold:
             if current not in ("", holder) and operation != Operation.TAKE_OVER:
                 raise Refusal(ErrorCode.BUSY, self._sentence())
             if operation == Operation.RELEASE:
+                self._evicted.pop(holder, None)  # that run has ended
                 if holder == self._holder:
                     self._holder = ""
                 return
@@ -107,6 +108,7 @@ class MirrorHold:
         So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must say so.
         """
         with self._lock:
+            self._evicted.pop(by, None)  # a command with take_over has taken the mirror back
             self._evict(by, by or ("a command with take_over" if self._current() else "a command"))
 
     def _check_evicted(self, holder: str) -> None:

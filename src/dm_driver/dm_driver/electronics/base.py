@@ -2,6 +2,7 @@
 
 import math
 import re
+import termios
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -17,6 +18,8 @@ from dm_driver.electronics.frame_format import FrameFormat
 
 #: `DriveElectronics.needs` of units at a serial port.
 SERIAL_PORT: Final = ("serial_port", "a device file such as /dev/ttyUSB0")
+#: What pySerial raises beside OSError of a port that has not the speed or parity asked for.
+_UNOPENED: Final = (ValueError, termios.error)
 
 
 class ElectronicsError(Exception):
@@ -128,7 +131,7 @@ class DriveElectronics(ABC):
             return
         try:
             self._do_open()
-        except (OSError, LinkError) as error:
+        except (OSError, LinkError, *_UNOPENED) as error:
             self._abandon()
             reason = re.sub(r".*\[Errno \d+\] ", "", str(error))  # pyserial says it twice, with the place
             raise LinkError(f"cannot open {self.where}: {reason}") from error

@@ -6,6 +6,7 @@ offset live in its non-volatile memory and shift every voltage.
 
 import fcntl
 import os
+import re
 import socket
 import struct
 import termios
@@ -53,11 +54,22 @@ def encode_frame(codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> bytes:
     return np.packbits(mask, bitorder="little").tobytes() + bytes([COMMAND_VALUE]) + values.tobytes()
 
 
+#: What pySerial would take for a part of its URL, and what no host name or IPv4 address holds.
+_NO_ADDRESS: Final = re.compile(r"[^\w.-]", re.ASCII)
+
+
 class _Edac40(DriveElectronics):
     channels = CHANNELS
     max_code = MAX_CODE
     needs = ("address", "the EDAC40's host name or IPv4 address")
     _protocol: str
+
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        super().__init__(settings)
+        if _NO_ADDRESS.search(settings.address):
+            raise ValueError(
+                f"electronics.address = {settings.address!r}: must be {self.needs[1]}; its port is electronics.port"
+            )
 
     @property
     def where(self) -> str:
