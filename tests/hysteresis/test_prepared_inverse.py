@@ -23,7 +23,8 @@ def fine(law: HysteresisModel) -> HysteresisModel:
     return replace(law, play_radius=radius, play_weight=weight)
 
 
-LAWS = [plays(), plays(0.01), fine(rich()), fine(rich(0.0)), fine(lagging()), fine(fading())]
+LAGGING = replace(lagging(), creep_rate=0.02)
+LAWS = [plays(), plays(0.01), fine(rich()), fine(rich(0.0)), fine(lagging()), fine(LAGGING), fine(fading())]
 
 
 def history(law: HysteresisModel, seed: int) -> HysteresisState:

@@ -191,7 +191,9 @@ def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
     write_record(file, AT_REST)
     whole = file.read_bytes()
     entry = whole.index(b"PK\x01\x02")
-    for torn in (b"PK\x03\x04 torn", whole[: entry + 10] + b"\x63" + whole[entry + 11 :]):  # of an unknown compression
+    unknown_compression = whole[: entry + 10] + b"\x63" + whole[entry + 11 :]
+    open_bracket = whole.replace(b", }", b",  ")
+    for torn in (b"PK\x03\x04 torn", unknown_compression, open_bracket):
         file.write_bytes(torn)
         with pytest.raises(ValueError, match=r"mirror\.creep\.npz"):
             read_record(file, 0.0)

@@ -26,8 +26,8 @@ from dm_common.limits import Limits
 #: Effective signals are met to this; a DAC step is three hundred times as large.
 TOLERANCE = 1e-7
 ROUNDS_MAX = 60
-#: Rounds of the inverse where a part follows the signals, which are known only then; less than two DAC steps are left.
-LAG_ROUNDS = 2
+#: Most rounds where a part follows the signals, known only then; what may be left of effective ones: 1/3 DAC step.
+LAG_ROUNDS, LAG_LEFT = 20, 1e-5
 #: Newton's step never divides by less; laws that can be inverted are steeper by far.
 SLOPE_MIN = 1e-3
 #: What neighbours stay below their limit: one step of a 16-bit DAC, since each of the two is rounded.
@@ -72,16 +72,22 @@ def invert(
         return Inverted(signals, effective - signals)
     faded, grown, followed = law.creep_ahead(state, ahead)
     grown, apart = grown + followed, state.signals - state.position
-    for _ in range(LAG_ROUNDS if law.lag_spectrum.size else 1):
+    for _ in range(LAG_ROUNDS):
         wanted = law.static_of(effective, grown, faded + followed * apart)
         inverted = pieces(law).solve(state, wanted, low, high)
-        apart = inverted.signals - wanted
-    limited = inverted.missed != 0.0
-    if not limited.any():
+        before, apart = apart, inverted.signals - wanted
+        if lag_followed(followed, apart - before):
+            break
+    if not inverted.missed.any():
         return inverted
     # A limit may lie before the place where the piece begins that the solution would need.
-    missed = np.where(limited, wanted - law.position_at(state, inverted.signals), 0.0)
+    missed = np.where(inverted.missed, wanted - law.position_at(state, inverted.signals), 0.0)
     return Inverted(inverted.signals, missed)
+
+
+def lag_followed(followed: Floats, change: Floats) -> bool:
+    """Whether no round is needed any more, by the `change` (N,) of what signals and static effective ones are apart."""
+    return not np.maximum.reduce(np.abs(followed * change)) > LAG_LEFT  # also where there is no number
 
 
 class Pieces:

@@ -255,13 +255,11 @@ class HysteresisModel:
 
     def static_of(self, effective: Floats, grown: Floats, faded: Floats) -> Floats:
         """(N,) static effective signals p of which `effective` (N,) is p + (1 + creep_slope p) (grown p + faded)."""
-        position = (effective - faded) / (1.0 + grown)
-        slope = self.creep_slope
-        if slope:  # one step of Newton's method: the change is small
-            position = position - slope * position * (grown * position + faded) / (
-                1.0 + grown + slope * (2.0 * grown * position + faded)
-            )
-        return np.asarray(position)
+        slope, rest = self.creep_slope, effective - faded
+        if not slope:
+            return np.asarray(rest / (1.0 + grown))
+        linear = 1.0 + grown + slope * faded
+        return np.asarray(2.0 * rest / (linear + np.sqrt(np.maximum(linear**2 + 4.0 * slope * grown * rest, 0.0))))
 
     def effective_at(self, state: HysteresisState, signals: Floats, ahead: float) -> Floats:
         """(N,) effective signal `ahead` s after a straight move from `state` to `signals` (N,)."""

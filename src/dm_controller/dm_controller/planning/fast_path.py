@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.inverse import LAG_ROUNDS, Pieces, horner, pieces
+from dm_common.hysteresis.inverse import LAG_ROUNDS, Pieces, horner, lag_followed, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
@@ -119,7 +119,6 @@ class PreparedInverse:
         self._low, self._high = limits.low, limits.high
         self._rate = -1.0 / law.creep_time
         self._law, self._share, self._lag = law, np.atleast_2d(law.creep_share), np.atleast_2d(law.lag_share)
-        self._rounds = LAG_ROUNDS if law.lag_spectrum.size else 1
         self._gap = self._share * (state.crept - state.position[:, None])
         self._gap[:, : self._lag.shape[1]] += self._lag * (state.lagged - state.signals[:, None])
         self._apart = state.signals - state.position
@@ -178,10 +177,12 @@ class PreparedInverse:
             return None
         faded, grown, followed = self._creep(time, ahead)
         signals, apart = self.state.signals, self._apart
-        for _ in range(self._rounds):
+        for _ in range(LAG_ROUNDS):
             wanted = self._law.static_of(effective, grown, faded + followed * apart)
             signals = self._looked_up(wanted)
-            apart = signals - wanted
+            before, apart = apart, signals - wanted
+            if lag_followed(followed, apart - before):
+                break
         # Not beyond an end by rounding either; where a piece is not exact there is no number.
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
         return np.asarray(signals) if inside and self._limits.allow_neighbours(signals) else None
