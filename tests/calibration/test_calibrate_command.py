@@ -187,6 +187,7 @@ class FakeClient:
             (1.9e-9, {}),
         ):
             show(Calibrate.Feedback(phase="hysteresis", reached_max_zernike=reached, **rest))
+        show(Calibrate.Feedback(phase="fit", step=452, steps=452, reached_max_zernike=1.9e-9))
         return Calibrate.Result(id="c1", maps=130, message="2 nm is reached: 1.9 nm", hysteresis_model="Preisach")
 
 
@@ -203,6 +204,7 @@ def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch
         "calibration: right to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
         "calibration: right to 1.9 nm so far",
     ]
+    assert "calibration: fit, step 452 of 452" in lines
     assert (
         "when flat: repeatable to 2 nm (λ/316), absolute to 5.4 nm (λ/118), limited by the instrument's own error"
         in done.output

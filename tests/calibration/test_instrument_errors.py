@@ -170,3 +170,52 @@ def test_an_aperture_that_follows_the_mirror_is_registered_to_a_tenth_of_a_pixel
     column, row = Ingest().read(file, settings)[1].centre
     pitch, middle = FIELD / PIXELS, 0.5 * (PIXELS - 1)
     assert (column, row) == pytest.approx((middle + x / pitch, middle - y / pitch), abs=0.1)
+
+
+def save(path: Path, sag: NDArray[np.float64], **others: Any) -> Path:
+    facts: dict[str, Any] = {"wavelength": 632.8e-9, "pitch": FIELD / PIXELS, "format": "array"} | others
+    path.write_bytes(fits_bytes(SurfaceMap(sag, **facts), "test"))
+    return path
+
+
+def refused(*words: object) -> str:
+    done = CliRunner().invoke(make_app(), ["instrument", *map(str, words)])
+    assert done.exit_code == 2
+    return " ".join(done.output.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("other", "text"), [({"wavelength": 532e-9}, "wavelength 532.000 nm"), ({"pitch": 3e-4}, "pitch 300.000 um")]
+)
+def test_flats_of_another_setting_are_not_mixed(other: dict[str, float], text: str, tmp_path: Path) -> None:
+    sag, rows = np.zeros((120, 120)), ["file, reference, part, degrees"]
+    for turn in (0, 37, 80):
+        name = save(tmp_path / f"{turn}.fits", sag, **(other if turn else {})).name
+        rows.append(f"{name}, A, B, {turn}")
+    table = tmp_path / "flats.csv"
+    table.write_text("\n".join(rows))
+    assert text in refused("flats", table, "--write", tmp_path / "flat.fits")
+    assert not (tmp_path / "flat.fits").exists()
+
+
+def test_flats_that_leave_only_high_orders_open_bound_the_coefficients(tmp_path: Path) -> None:
+    """Headings in columns, as an editor aligns them, are headings too."""
+    y, x = (np.mgrid[:120, :120] - 59.5) / 60.0
+    noise, rows = np.random.default_rng(2), ["file , reference , part , degrees"]
+    for number, row in enumerate(("A, B,", "A, B, 37", "A, C,", "B, C,")):
+        sag = np.where(np.hypot(x, y) < 0.97, noise.normal(0.0, 1e-9, x.shape), np.nan)
+        rows.append(f"{save(tmp_path / f'{number}.fits', sag).name}, {row}")
+    table = tmp_path / "flats.csv"
+    table.write_text("\n".join(rows))
+    found = run("flats", table, "--write", tmp_path / "flat.fits")
+    assert 0.0 < found["instrument_error"] < 1e-9  # orders 9 and 10 are open, which no coefficient is of
+
+
+def test_marks_in_millimetres_are_not_taken_for_metres(tmp_path: Path) -> None:
+    surface = save(tmp_path / "any.fits", np.zeros((PIXELS, PIXELS)))
+    table = tmp_path / "marks.csv"
+    millimetres = 1e3 * FIELD / PIXELS
+    places = [(column, row) for column in (9, 30, 50) for row in (8, 30, 50)]
+    rows = [f"{column},{row},{column * millimetres},{row * millimetres}" for column, row in places]
+    table.write_text("\n".join(["column,row,x,y", *rows]))
+    assert "x and y must be in m" in refused("grid", table, surface)

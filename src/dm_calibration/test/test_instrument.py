@@ -135,9 +135,13 @@ def test_scale_and_distortion_from_a_grid(mirrored: bool, distortion: float) -> 
     assert found.left == pytest.approx(0.03 * np.sqrt(2.0) * pitch, rel=0.3)
 
 
-def test_marks_on_a_line_are_refused() -> None:
+@pytest.mark.parametrize("seen", [np.zeros((9, 2)), np.arange(9.0)[:, None] * (1.0, 2.0)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_marks_on_a_line_are_refused(seen: np.ndarray, turned: bool) -> None:
+    """Where they are seen too: a column written twice ended as "Singular matrix"."""
+    places = 1e-3 * np.array([(x, y) for x in range(3) for y in range(3)])
     with pytest.raises(ValueError, match="9 marks: must be 8 or more, and not all on one line"):
-        lateral_scale(np.arange(9.0)[:, None] * np.ones(4), (SIZE, SIZE))
+        lateral_scale(np.hstack((places, seen) if turned else (seen, places)), (SIZE, SIZE))
 
 
 def test_undistorted_is_where_it_is() -> None:

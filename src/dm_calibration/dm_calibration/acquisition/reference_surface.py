@@ -7,6 +7,9 @@ from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
 
+#: How the reference surface is called in sentences: as the parameter that names its file.
+NAME = "reference_surface"
+
 
 def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float) -> SurfaceMap:
     """The reference surface in a map file.
@@ -36,25 +39,30 @@ def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavele
         pitch: of files that do not tell it, m per pixel; 0 = not known.
 
     Raises:
-        MapRejectedError: another size, place on the camera, pitch or wavelength than the reference surface, or a map
-            from which the instrument has subtracted its error already.
+        MapRejectedError: see :func:`difference`.
+    """
+    if different := difference(source, reference, pitch, wavelength_tolerance):
+        raise MapRejectedError(different)
+    return source.sag - reference.sag
+
+
+def difference(
+    source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float, name: str = NAME
+) -> str:
+    """Why a map cannot be set against another, called `name`; "" = it can.
+
+    They are of another size, place on the camera, pitch or wavelength, or the instrument has subtracted its error from
+    the map already. Args as of :func:`absolute_sag`.
     """
     size = "{1} x {0} pixels from column {2}, row {3} of the camera"
     here, there = ((*each.sag.shape, *each.origin) for each in (source, reference))
     pitches = [each.pitch or pitch for each in (source, reference)]
-    different = ""
     if here != there:
-        different = f"{size.format(*here)}, reference_surface has {size.format(*there)}"
-    elif all(pitches) and abs(pitches[0] - pitches[1]) > PITCH_TOLERANCE * pitches[1]:
-        different = f"pitch {pitches[0] * 1e6:.3f} um, reference_surface has {pitches[1] * 1e6:.3f} um"
-    elif reference.wavelength and abs(source.wavelength - reference.wavelength) > wavelength_tolerance:
-        different = (
-            f"wavelength {source.wavelength * 1e9:.3f} nm, reference_surface has {reference.wavelength * 1e9:.3f} nm"
-        )
-    elif source.system_error_subtracted:
-        different = (
-            "the instrument has subtracted its own error already: leave reference_surface empty, or switch that off"
-        )
-    if different:
-        raise MapRejectedError(different)
-    return source.sag - reference.sag
+        return f"{size.format(*here)}, {name} has {size.format(*there)}"
+    if all(pitches) and abs(pitches[0] - pitches[1]) > PITCH_TOLERANCE * pitches[1]:
+        return f"pitch {pitches[0] * 1e6:.3f} um, {name} has {pitches[1] * 1e6:.3f} um"
+    if reference.wavelength and abs(source.wavelength - reference.wavelength) > wavelength_tolerance:
+        return f"wavelength {source.wavelength * 1e9:.3f} nm, {name} has {reference.wavelength * 1e9:.3f} nm"
+    if source.system_error_subtracted:
+        return "the instrument has subtracted its own error already: leave reference_surface empty, or switch that off"
+    return ""

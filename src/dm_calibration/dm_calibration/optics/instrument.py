@@ -130,7 +130,11 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     half = 0.5 * max(shape)
     column, row, x, y = np.asarray(marks, dtype=np.float64).reshape(-1, 4).T
     seen = np.asarray((column - 0.5 * (shape[1] - 1) + 1j * (0.5 * (shape[0] - 1) - row)) / half, dtype=np.complex128)
-    if len(seen) < POINTS_MIN or np.linalg.matrix_rank(np.column_stack((np.ones(len(x)), x, y)), 1e-9) < 3:
+    ranks = (
+        np.linalg.matrix_rank(np.column_stack((np.ones(len(x)), *place)), 1e-9)
+        for place in ((x, y), (seen.real, seen.imag))
+    )
+    if len(seen) < POINTS_MIN or min(ranks) < 3:
         raise ValueError(f"{len(seen)} marks: must be {POINTS_MIN} or more, and not all on one line")
     fits = [_similarity(seen, place) for place in (x + 1j * y, -x + 1j * y)]  # the camera may show a mirror image
     values, covariance, left = min(fits, key=lambda fit: fit[2])

@@ -53,8 +53,9 @@ def run_calibration(client: Any, goal: Any) -> Any:
         def show(feedback: Any) -> None:
             nonlocal said, reached
             text = calibration_step(feedback)
-            if not console.is_terminal and text.split()[0] != said:  # no bar is drawn: one line a phase
-                said = text.split()[0]
+            phase = text.split()[0].rstrip(",")
+            if not console.is_terminal and phase != said:  # no bar is drawn: one line a phase
+                said = phase
                 console.print(f"calibration: {said}, step {feedback.step} of {feedback.steps}")
             if feedback.reached_max_zernike != reached:
                 reached = feedback.reached_max_zernike

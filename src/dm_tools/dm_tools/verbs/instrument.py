@@ -68,7 +68,7 @@ def instrument(
         elif procedure is Procedure.RETRACE:
             found = _retrace([read(file).sag for file in files])
         else:
-            found = _grid(files[0], read(files[1]).sag.shape)
+            found = _grid(files[0], read(files[1]))
     except (CodedError, ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from error
     console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
@@ -78,15 +78,22 @@ def instrument(
 
 def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
     """Write the error of the flat that is the first reference in `table`."""
+    from dm_calibration.acquisition.reference_surface import difference
     from dm_calibration.map_files.fits import fits_bytes
     from dm_calibration.optics.flats import FlatTest, reference_from_flats
+    from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
     from dm_common.atomic_write import write_whole
+    from dm_common.optics.zernike import MAX_ORDER
 
     rows = _table(table, "file", "reference", "part", "degrees")
     sources = [table.parent / row[0] for row in rows]
     if target.resolve() in [source.resolve() for source in (table, *sources)]:
         raise ValueError(f"--write {target}: is read for this; give another file")
     surfaces = [read(source) for source in sources]
+    tolerance = WAVELENGTH_TOLERANCE * surfaces[0].wavelength
+    for source, surface in zip(sources, surfaces, strict=True):
+        if different := difference(surface, surfaces[0], 0.0, tolerance, str(sources[0])):
+            raise ValueError(f"{source}: {different}")
     tests = [
         FlatTest(surface.sag, reference, part, math.radians(float(degrees)))
         for surface, (_, reference, part, degrees) in zip(surfaces, rows, strict=True)
@@ -106,7 +113,8 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
             "the flats, or turn one by an angle of no simple share of a turn",
             soft_wrap=True,
         )
-    known = not found.open_orders and math.isfinite(found.bound)
+    # The bound is one on coefficients up to this order, which hold nothing of the orders beyond.
+    known = not any(order <= MAX_ORDER for order in found.open_orders) and math.isfinite(found.bound)
     return {"reference_surface": str(target.absolute())} | ({"instrument_error": found.bound} if known else {})
 
 
@@ -121,11 +129,17 @@ def _retrace(maps: list[Any]) -> dict[str, Any]:
     return {"retrace": [round(float(value), 9) for value in found]}
 
 
-def _grid(table: Path, shape: tuple[int, int]) -> dict[str, Any]:
+def _grid(table: Path, surface: Any) -> dict[str, Any]:
+    from dm_calibration.acquisition.ingest import ZOOM_SHARE
     from dm_calibration.optics.instrument import lateral_scale
 
     marks = [[float(value) for value in row] for row in _table(table, "column", "row", "x", "y")]
-    found = lateral_scale(marks, shape)
+    found = lateral_scale(marks, surface.sag.shape)
+    if surface.pitch and abs(surface.pitch - found.pitch) > ZOOM_SHARE * found.pitch:  # the node would refuse every map
+        raise ValueError(
+            f"{table}: the marks give {found.pitch * 1e6:.3f} um per pixel, the map tells {surface.pitch * 1e6:.3f}: "
+            "x and y must be in m, and the map of the same zoom"
+        )
     console.print(
         f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks are "
         f"{found.left * 1e6:.2f} um from where that puts them, rms",
@@ -146,7 +160,10 @@ def _table(path: Path, *names: str) -> list[list[str]]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
-            rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
+            rows = [
+                {(name or "").strip(): value for name, value in row.items()}
+                for row in csv.DictReader(file, restval="", skipinitialspace=True)
+            ]
     except (csv.Error, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: must be a table, CSV in UTF-8: {error}") from error
     missing = [name for name in names if name != "degrees" and (not rows or name not in rows[0])]
