@@ -76,18 +76,13 @@ def invert(
         wanted = law.static_of(effective, grown, faded + followed * apart)
         inverted = pieces(law).solve(state, wanted, low, high)
         before, apart = apart, inverted.signals - wanted
-        if lag_followed(followed, apart - before):
+        if not np.maximum.reduce(np.abs(followed * (apart - before))) > LAG_LEFT:  # also where there is no number
             break
     if not inverted.missed.any():
         return inverted
     # A limit may lie before the place where the piece begins that the solution would need.
     missed = np.where(inverted.missed, wanted - law.position_at(state, inverted.signals), 0.0)
     return Inverted(inverted.signals, missed)
-
-
-def lag_followed(followed: Floats, change: Floats) -> bool:
-    """Whether no round is needed any more, by the `change` (N,) of what signals and static effective ones are apart."""
-    return not np.maximum.reduce(np.abs(followed * change)) > LAG_LEFT  # also where there is no number
 
 
 class Pieces:

@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.inverse import LAG_ROUNDS, Pieces, horner, lag_followed, pieces
+from dm_common.hysteresis.inverse import LAG_LEFT, LAG_ROUNDS, Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
@@ -181,7 +181,7 @@ class PreparedInverse:
             wanted = self._law.static_of(effective, grown, faded + followed * apart)
             signals = self._looked_up(wanted)
             before, apart = apart, signals - wanted
-            if lag_followed(followed, apart - before):
+            if not np.maximum.reduce(np.abs(followed * (apart - before))) > LAG_LEFT:  # also where there is no number
                 break
         # Not beyond an end by rounding either; where a piece is not exact there is no number.
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
