@@ -134,6 +134,25 @@ def test_own_laws_that_creep_without_bound_are_refused() -> None:
     assert "creeps by 20% per decade" in found.refused[own]
 
 
+def test_own_laws_that_cannot_be_inverted_are_drawn_nearer_to_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, check = relay_run(0.2, 14, 120)
+    tried: list[HysteresisModel] = []
+
+    def slope(law: HysteresisModel, low: float, high: float) -> float:
+        if law.play_weight.ndim < 3:
+            return 1.0
+        tried.append(law)
+        return -1.0 if len(tried) == 1 else 1.0
+
+    monkeypatch.setattr(law_shape, "slope_min", slope)
+    preisach = tuple(law for law in CANDIDATES if law.name.startswith("Preisach") and not law.slopes)
+    found, common = identify(run, check, (COMMON[0], *preisach)), identify(run, check, (COMMON[0], preisach[0]))
+    assert found.fit.candidate.own and not found.refused and len(tried) == 2
+    apart = [float(np.std(law.play_weight, axis=0).sum()) for law in tried]
+    assert apart[1] < 0.9 * apart[0]
+    assert held_out_rms(common) > 1.5 * held_out_rms(found)
+
+
 def test_own_laws_whose_fading_cannot_be_inverted_fade_as_the_common_law(monkeypatch: pytest.MonkeyPatch) -> None:
     run, check = relay_run(0.2, 14, 120)
 

@@ -49,7 +49,9 @@ def load_config(path: Path, namespace: str = "") -> Config:
     own, of_all = set[str](), dict[str, Any]()
     for key, section in content.items():
         place, _, name = str(key).rpartition("/")
-        if namespace and place.partition("*")[0].strip("/") not in ("", namespace):
+        prefix, below, _ = place.partition("*")
+        prefix = prefix.strip("/")
+        if namespace and prefix not in ("", namespace) and not (below and namespace.startswith(f"{prefix}/")):
             continue
         if name not in NAMES and name != "**":
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
@@ -66,6 +68,8 @@ def load_config(path: Path, namespace: str = "") -> Config:
             raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or chosen by --namespace")
         own.add(name)
         result[name] = result.get(name, {}) | values
+    if of_all:  # also for nodes that run without a section of their own
+        result = {node.name: result.get(node.name, {}) for node in nodes_of(result)}
     return {name: of_all | values for name, values in result.items()}
 
 

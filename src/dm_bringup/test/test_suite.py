@@ -78,7 +78,9 @@ def test_a_section_of_all_nodes_counts_for_those_that_the_file_names(tmp_path: P
     of_each = "/**/calibration: {ros__parameters: {rate: 2.0}}\npdm_driver: {ros__parameters: {}}\n"
     file.write_text(of_all + of_each)
     named = {"use_sim_time": True, "rate": 1.0}
-    assert load_config(file) == {"calibration": named | {"rate": 2.0}, "pdm_driver": named}
+    nodes = load_config(file)
+    assert nodes["calibration"] == named | {"rate": 2.0} and nodes["pdm_driver"] == nodes["focus_controller"] == named
+    assert "virtual_bench" not in nodes
 
 
 def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: 
         lines.write("/**/pdm_driver: {ros__parameters: {volts.max: 200.0, simple: 2}}\n")
     assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0, "simple": 2}}
     file.write_text("/left/**/pdm_driver: {ros__parameters: {simple: 1}}\n")  # of nodes below /left only
-    assert load_config(file, "left") and not load_config(file, "right")
+    assert load_config(file, "left") and load_config(file, "left/upper") and not load_config(file, "right")
     file.write_text("# 3 µm\n", encoding="latin-1")  # as some editors of Windows do
     with pytest.raises(ConfigError, match=r"config\.yaml: not a YAML file in UTF-8"):
         load_config(file)

@@ -112,7 +112,7 @@ class ActuatorWriter(WriterThread):
             return self.command(shape)
 
     def turn_back(self, move: Move, halt: bool = False) -> Move | None:
-        """Leave `move` for the shape that was requested before it, with `halt` for that in which the mirror is.
+        """Leave `move` for the shape that was requested before it, with `halt` for where the mirror is, within a step.
 
         Returns the way there; None = something else was asked for since.
         """

@@ -69,7 +69,7 @@ class LastShape:
             if (codes := self.load()) is not None:
                 return limiter.check_shape(scale.signals_of_codes(codes), "what was sent last")
         except (OSError, Refusal) as error:  # the limits have changed: no legal way begins there
-            logging.getLogger(__name__).warning("the first shape is written in one step: %s", error)
+            logging.getLogger(__name__).warning("what was recorded last is not gone by: %s", error)
         return own
 
     def note(self, codes: Shape) -> None:

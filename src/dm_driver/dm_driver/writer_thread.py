@@ -2,8 +2,7 @@
 
 It writes one step of the current move after the other, paced so that the slew rate holds, and leaves a move at once for
 a newer one. After a lost link it tries to reconnect once a second, then writes the last shape again and goes on to the
-safe shape where it was on its way there. Where another driver had the unit meanwhile, it begins where that
-one ended, and goes to the safe shape.
+safe shape where it was on its way there. Where another driver had the unit, it begins where that one ended.
 """
 
 import logging
@@ -184,10 +183,12 @@ class WriterThread:
         if self._rewrite_due:
             self._confirm()  # first, for what is sent is recorded: a busy unit stands where its own driver puts it
             with self._change:
-                own, self._shape = self._shape, self._last.known(self._shape, self._output.scale, self._limiter)
-                if self._shape is not own and self._rewrite_due and self._queue.newest is None:
-                    self._put(Move(Kind.SAFE, self._safe_shape))
-            self._rewrite()
+                if due := self._rewrite_due and not self._stopping:  # it may have been disabled meanwhile
+                    own, self._shape = self._shape, self._last.known(self._shape, self._output.scale, self._limiter)
+                    if self._shape is not own and self._queue.newest is None:
+                        self._put(Move(Kind.SAFE, self._safe_shape))
+            if due:
+                self._rewrite()
         self._confirm()
         with self._change:
             self._link_up = True

@@ -286,7 +286,7 @@ def test_a_degauss_that_halts_swings_no_more(unit: Edac40TcpUnit) -> None:
         assert there is not None and there.wait(5) is Outcome.REACHED and move.wait(5) is Outcome.SUPERSEDED
         wait_until(lambda: len(unit.frames) == writer.state().sequence)
         seen = signals_of(unit.frames)
-        assert np.abs(seen[-1] - seen[-2]).max() <= CODE
+        assert np.abs(seen[-1] - seen[-2]).max() <= 0.1 + CODE
         assert writer.state().moving is None and writer.turn_back(move, halt=True) is None
 
 

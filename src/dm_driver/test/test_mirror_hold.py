@@ -100,7 +100,7 @@ def test_who_lost_it_is_heard_again_after_giving_it_back_or_taking_it(hold: Mirr
         hold.ask(Operation.RELEASE, "calibration")
     else:
         assert hold.check("calibration", take_over=True)
-        hold.evict("calibration")
+        hold.evict("calibration", take_over=True)
     assert not hold.check("calibration", take_over=False)
 
 

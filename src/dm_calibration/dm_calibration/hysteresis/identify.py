@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
 from dm_calibration.hysteresis.excitation import MAPS_PER_ACTUATOR
-from dm_calibration.hysteresis.own_laws import OwnLaws
+from dm_calibration.hysteresis.own_laws import ALIKE, OwnLaws
 from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
@@ -89,8 +89,8 @@ def identify(
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
             hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all;
-            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next; at
-            last all actuators fade as the common one does.
+            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next; then
+            all actuators fade as the common one does; at last they differ less.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -176,17 +176,20 @@ def _begun(
 
     How hysteresis fades stays nearly as it begins, and a law without plays may begin far from what it is, or one that
     cannot be inverted near it: another than the first of `starts` comes first where it leaves much less.
-    At last come those that keep the Duhem operator they begin with, the same for all actuators.
+    Then come those that keep the Duhem operator they begin with, the same for all actuators, and at last laws that
+    differ less between actuators.
     """
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter) for fit in starts))
-    if not candidate.slopes:
+    if candidate.slopes:
+        made = list(fitted)
+        left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
+        for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
+            yield made[number]
+        for own, _ in made:
+            yield own, own.fit(keep, own_fading=False)
+    else:
         yield from fitted
-        return
-    made = list(fitted)
-    left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
-    for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
-        yield made[number]
-    for own, _ in made:
+    for own in (OwnLaws(run, candidate, fit.law, scatter, ALIKE) for fit in starts):
         yield own, own.fit(keep, own_fading=False)
 
 

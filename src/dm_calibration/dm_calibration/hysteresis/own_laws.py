@@ -68,6 +68,9 @@ ROUNDS, ROUNDS_MAPS = 20, 300
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
 SPREAD = 0.1
+#: The same where laws cannot be inverted otherwise: one of many may fall where hardly a map shows it. On a mirror with
+#: 100 maps 95 % of the requests were within 15 nm then, and within 55 with one law for all.
+ALIKE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +96,12 @@ class OwnLaws:
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
+        spread: of the patterns between actuators.
     """
 
-    def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
+    def __init__(
+        self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, spread: float = SPREAD
+    ) -> None:
         self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
         self.candidate = candidate
         self.radius = candidate.radius
@@ -114,7 +120,7 @@ class OwnLaws:
         first = 1 + self._basis.shape[1]
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         count = signals.shape[1]
-        self._between = _alike(count, SPREAD)
+        self._between = _alike(count, spread)
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)

@@ -71,12 +71,13 @@ def invert(
         signals = np.clip(effective, low, high)
         return Inverted(signals, effective - signals)
     faded, grown, followed = law.creep_ahead(state, ahead)
-    grown, apart = grown + followed, state.signals - state.position
+    grown, apart, left = grown + followed, state.signals - state.position, np.inf
     for _ in range(LAG_ROUNDS):
         wanted = law.static_of(effective, grown, faded + followed * apart)
         inverted = pieces(law).solve(state, wanted, low, high)
         before, apart = apart, inverted.signals - wanted
-        if not np.maximum.reduce(np.abs(followed * (apart - before))) > LAG_LEFT:  # also where there is no number
+        last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
+        if not LAG_LEFT < left < last:  # where it grows, further rounds would lead away
             break
     if not inverted.missed.any():
         return inverted

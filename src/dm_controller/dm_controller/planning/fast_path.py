@@ -176,12 +176,13 @@ class PreparedInverse:
         if not self._serves:
             return None
         faded, grown, followed = self._creep(time, ahead)
-        signals, apart = self.state.signals, self._apart
+        signals, apart, left = self.state.signals, self._apart, np.inf
         for _ in range(LAG_ROUNDS):
             wanted = self._law.static_of(effective, grown, faded + followed * apart)
             signals = self._looked_up(wanted)
             before, apart = apart, signals - wanted
-            if not np.maximum.reduce(np.abs(followed * (apart - before))) > LAG_LEFT:  # also where there is no number
+            last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
+            if not LAG_LEFT < left < last:  # as in `invert`; also where there is no number
                 break
         # Not beyond an end by rounding either; where a piece is not exact there is no number.
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high

@@ -71,7 +71,7 @@ class CommandGate:
             result = carry_out(writer, configuration)
             if result is not None:
                 holder = self.hold.holder
-                self.hold.evict(request.holder)
+                self.hold.evict(request.holder, request.take_over)
                 if takes_over:
                     by = request.holder or "nobody in particular"
                     self._report(f"{source} of {by} took the mirror from {holder}", True)

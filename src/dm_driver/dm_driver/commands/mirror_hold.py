@@ -73,10 +73,11 @@ class MirrorHold:
             current = self._current()
             if operation == Operation.RENEW:
                 self._check_evicted(holder)
+            if operation == Operation.RELEASE:
+                self._evicted.pop(holder, None)  # that run has ended
             if current not in ("", holder) and operation != Operation.TAKE_OVER:
                 raise Refusal(ErrorCode.BUSY, self._sentence())
             if operation == Operation.RELEASE:
-                self._evicted.pop(holder, None)  # that run has ended
                 if holder == self._holder:
                     self._holder = ""
                 return
@@ -102,13 +103,14 @@ class MirrorHold:
                 raise Refusal(ErrorCode.BUSY, self._sentence())
             return other
 
-    def evict(self, by: str) -> None:
+    def evict(self, by: str, take_over: bool = False) -> None:
         """A command of `by` ("" = nobody in particular) is carried out: whoever else has the mirror loses it.
 
         So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must say so.
         """
         with self._lock:
-            self._evicted.pop(by, None)  # a command with take_over has taken the mirror back
+            if take_over:  # it has taken the mirror back
+                self._evicted.pop(by, None)
             self._evict(by, by or ("a command with take_over" if self._current() else "a command"))
 
     def _check_evicted(self, holder: str) -> None:

@@ -75,7 +75,8 @@ class DriveElectronics(ABC):
     Outputs hold their last values when the link closes, and no supported unit can be read back: what was written is
     all that is known. One thread uses an object at a time.
 
-    Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link.
+    Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link; `_do_open` also what `_UNOPENED`
+    names.
 
     Args:
         settings: where it is.

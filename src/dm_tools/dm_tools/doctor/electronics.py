@@ -36,11 +36,11 @@ def opens(kind: str, driver: Mapping[str, Any]) -> Finding | None:
 
     address, port, channels = (driver[name] for name in ("electronics.address", "electronics.port", "mirror.actuators"))
     settings = ElectronicsSettings(address, port, channels=channels)
-    electronics = BACK_ENDS[kind](settings)
     try:
+        electronics = BACK_ENDS[kind](settings)
         electronics.open()
         electronics.close()
-    except LinkError as error:
+    except (LinkError, ValueError) as error:
         return Finding(str(error), CURES[kind])
     return None
 

@@ -74,8 +74,8 @@ def _no_check(client: Any) -> Iterator[None]:
     if not (heard and get_parameter(client, node, name)):
         yield
         return
-    set_parameter(client, node, name, False)
     try:
+        set_parameter(client, node, name, False)
         yield
     finally:
         try:
