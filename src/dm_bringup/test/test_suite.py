@@ -72,7 +72,7 @@ def test_numbers_that_yaml_takes_for_texts_stay_numbers_in_lists(tmp_path: Path)
     assert load_config(file) == {"pdm_driver": {"limits": [1e5, 0.5]}}
 
 
-def test_a_section_of_all_nodes_counts_for_those_that_the_file_names(tmp_path: Path) -> None:
+def test_a_section_of_all_nodes_counts_for_each_that_runs(tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     of_all = "/**: {ros__parameters: {use_sim_time: true, rate: 1.0}}\n"
     of_each = "/**/calibration: {ros__parameters: {rate: 2.0}}\npdm_driver: {ros__parameters: {}}\n"

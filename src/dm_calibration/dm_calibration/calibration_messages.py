@@ -12,6 +12,7 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.updates import InUse
 from dm_common import Floats
@@ -60,7 +61,7 @@ def calibration_message(
         setattr(message, name, doubles(getattr(fit, name)))
     doubtful = calibration.doubts(calibrated_error_max)
     message.quality = Capabilities.APPROXIMATE if doubtful else Capabilities.CALIBRATED
-    message.actuator_grade = [GRADE_NAMES[grade] for grade in fit.grades]
+    message.actuator_grade = _grades(fit)
     message.known_limitations = list(calibration.limitations)
     message.region_weights = doubles(calibration.region_weights)
     if calibration.hysteresis is not None:
@@ -88,9 +89,13 @@ def put_updates(
     message.checked = time_message(drift.checked_ns)
     message.creep_shown = drift.trust
     message.known_limitations = [*message.known_limitations, *doubts]
-    message.actuator_grade = [GRADE_NAMES[grade] for grade in fit.grades]
+    message.actuator_grade = _grades(fit)
     if mirror_changed or drift.given_up:
         message.quality = Capabilities.APPROXIMATE
+
+
+def _grades(fit: InfluenceFit) -> list[str]:
+    return [GRADE_NAMES[grade] for grade in fit.grades]
 
 
 def _slopes(law: HysteresisModel) -> Floats:
