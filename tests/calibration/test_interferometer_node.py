@@ -221,7 +221,7 @@ def pairs(array: DiagnosticArray) -> set[tuple[str, str]]:
     return {(value.key, value.value) for value in array.status[0].values}
 
 
-def test_triggered_measurement_is_published_once(observer: Observer, start: Start, tmp_path: Path) -> None:
+def test_a_triggered_map_is_published_once_or_answered_only(observer: Observer, start: Start, tmp_path: Path) -> None:
     folder = tmp_path / "maps"
     folder.mkdir()
     write_datx(tmp_path / "source.datx", surface(), pitch=PITCH)
@@ -244,6 +244,8 @@ def test_triggered_measurement_is_published_once(observer: Observer, start: Star
     np.testing.assert_allclose(answer.zernike.coefficients, expected, atol=1e-14)
     assert answer.zernike.radius == pytest.approx(0.011)
     assert Path(answer.info.file).parent == folder
+    alone = bench.measure(label="sphere", answer_only=True)
+    assert alone.error_code == ErrorCode.OK and alone.zernike.coefficients == answer.zernike.coefficients
     (folder / "by_hand.datx").write_bytes((tmp_path / "source.datx").read_bytes())
     bench.wait_for_maps(2)
     assert [info.file for info in bench.infos] == [answer.info.file, str(folder / "by_hand.datx")]

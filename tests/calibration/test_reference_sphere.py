@@ -36,22 +36,16 @@ def test_what_is_no_radius_is_refused_before_a_map_is_taken(radius: str) -> None
     assert done.exit_code == 2 and f"--reference-sphere {radius}: must be a radius in m" in done.output
 
 
-@pytest.mark.parametrize("enabled", [True, False])
-def test_the_map_of_a_sphere_is_not_compared_with_the_calibration(
-    enabled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now, seen = {"updates.enable": enabled}, list[bool]()
-    monkeypatch.setattr(measure, "nodes_of_suite", lambda client: {"calibration": 1})
-    monkeypatch.setattr(measure, "get_parameter", lambda client, node, name: now[name])
-    monkeypatch.setattr(measure, "set_parameter", lambda client, node, name, value: now.update({name: value}))
+@pytest.mark.parametrize("sphere", [True, False])
+def test_the_map_of_a_sphere_is_published_to_nobody(sphere: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[bool]()
 
-    def failing(label: str) -> None:
-        seen.append(now["updates.enable"])
+    def failing(label: str, answer_only: bool) -> None:
+        asked.append(answer_only)
         raise RuntimeError("no map")
 
-    client = SimpleNamespace(measure=failing, wait=lambda condition, timeout_s: condition())
+    client = SimpleNamespace(measure=failing)
     monkeypatch.setattr(measure, "running_suite", lambda namespace: nullcontext(client))
-    monkeypatch.setattr(measure, "REPORT_S", 0.0)
-    for words in (["--reference-sphere", "2"], []):
-        assert CliRunner().invoke(cli.app, ["measure", *words]).exit_code == 1
-    assert (seen, now) == ([False, enabled], {"updates.enable": enabled})
+    words = ["--reference-sphere", "2"] if sphere else []
+    assert CliRunner().invoke(cli.app, ["measure", *words]).exit_code == 1
+    assert asked == [sphere]

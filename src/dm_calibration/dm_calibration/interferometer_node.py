@@ -135,7 +135,7 @@ class InterferometerNode(ManagedNode):
                 raise MapFileError(f"{request.path}: {error}") from error
             surface, measured = self._read(path)
         header = self._header(self._file_time(surface, believe_header=True))
-        return self._accept(response, surface, measured, header, "ingested")
+        return self._accept(response, surface, measured, header, "ingested", publish=True)
 
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         acquisition = self._acquisition
@@ -145,7 +145,8 @@ class InterferometerNode(ManagedNode):
         with self._counting_refusals():
             surface, measured = acquisition.acquire(timeout_s)
         header = self._header(measured.stamp_ns or self._file_time(surface, believe_header=False))
-        return self._accept(response, surface, measured, header, f"measured {request.label}".strip())
+        what = f"measured {request.label}".strip()
+        return self._accept(response, surface, measured, header, what, publish=not request.answer_only)
 
     def _on_new_file(self, path: Path) -> None:
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""
@@ -181,8 +182,10 @@ class InterferometerNode(ManagedNode):
             reference=self._reference,
         )
 
-    def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
-        if self.active:
+    def _accept(
+        self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str, *, publish: bool
+    ) -> Any:
+        if publish and self.active:
             self._publish(surface, measured, header)
         self._log_taken(surface, measured, what)
         name = Path(surface.file).name or surface.instrument

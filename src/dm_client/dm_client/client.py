@@ -182,9 +182,12 @@ class DeformableMirrorClient(Connection):
         """Remove the hysteresis and end at mid range; `steps` half-swings, 0 = as configured in the driver."""
         return self.run_action("degauss", filled(Degauss.Goal, steps=steps, **claim), on_feedback, timeout_s)
 
-    def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
-        """Take one map with the interferometer, which gives up after `timeout_s` and says why."""
-        request = filled(Measure.Request, label=label, timeout=timeout_s)
+    def measure(self, label: str = "", timeout_s: float = 60.0, *, answer_only: bool = False) -> Measure.Response:
+        """Take one map with the interferometer, which gives up after `timeout_s` and says why.
+
+        With `answer_only` no other node hears of it, for maps of something else in the mirror's place.
+        """
+        request = filled(Measure.Request, label=label, timeout=timeout_s, answer_only=answer_only)
         return self.call("measure", request, timeout_s + 5.0)
 
     def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:

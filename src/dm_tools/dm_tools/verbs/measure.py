@@ -1,16 +1,12 @@
 """`dm measure`: take one map of the mirror as it stands."""
 
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from typing import Annotated, Any
 
 import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
-from dm_tools.parameter_changes import get_parameter, set_parameter
-from dm_tools.running_suite import FIND_S, REPORT_S, nodes_of_suite, running_suite
+from dm_tools.running_suite import running_suite
 
 
 def measure(
@@ -32,8 +28,7 @@ def measure(
     if reference_sphere is not None and not 0.0 < abs(reference_sphere) < math.inf:
         raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
-        with nullcontext() if reference_sphere is None else _no_check(client):
-            answer = client.measure(label)
+        answer = client.measure(label, answer_only=reference_sphere is not None)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
     radius = info.aperture_radius
     figures: dict[str, Any] = {
@@ -64,24 +59,6 @@ def measure(
         return
     write_json(json, {"measure": figures})
     next_step("./dm check compares a map with the calibration in use")
-
-
-@contextmanager
-def _no_check(client: Any) -> Iterator[None]:
-    """A map taken within is none of the mirror, and not compared with the calibration in use."""
-    node, name = "calibration", "updates.enable"
-    heard = client.wait(lambda: nodes_of_suite(client)[node] > 0, FIND_S)
-    if not (heard and get_parameter(client, node, name)):
-        yield
-        return
-    try:
-        set_parameter(client, node, name, False)
-        yield
-    finally:
-        try:
-            time.sleep(REPORT_S)  # its messages may reach that node later than the answer this one
-        finally:  # Ctrl-C too
-            set_parameter(client, node, name, True)
 
 
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:
