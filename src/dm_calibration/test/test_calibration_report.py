@@ -28,7 +28,7 @@ from dm_calibration.recalibration.drift import UpdateOptions
 from dm_calibration.recalibration.update_storage import write_updates
 from dm_calibration.recalibration.updates import SUFFIX, RecalibrationManager
 from dm_calibration.report import content, content_hysteresis
-from dm_calibration.report.certificate import certificate, curvatures, keep_people, people
+from dm_calibration.report.certificate import certificate, keep_people, people, spheres
 from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content_fit import residuals
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
@@ -119,7 +119,8 @@ def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) ->
     assert "approximate: the promise is above 32 nm" in first and "<img " in first
     assert f"{calibration.fit.held_out_max_zernike * 1e9:.2f} nm" in first and "95 % bound" in first
     assert "2023-12-14" in first, "valid for thirty days"
-    low, high = curvatures(calibration)
+    low, high, predicted = spheres(calibration)
+    assert f"{predicted * 1e9:.2f} nm" in first and "of what is predicted in every" in first
     assert -0.3 < low < -0.2 and 0.2 < high < 0.3 and f"{low:+.3f} to {high:+.3f} 1/m" in first
     assert '<th scope="col">SHA' not in page[: page.index("<h2>Files")]
 
@@ -127,22 +128,31 @@ def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) ->
 def test_a_mirror_that_is_only_pulled_has_a_range(calibration: Calibration) -> None:
     """Its figure is a bowl, deeper than its signals can flatten."""
     fit = calibration.fit
-    low, high = curvatures(calibration)
+    low, high, predicted = spheres(calibration)
     bowl = np.where(np.arange(21) == 3, 12e-6, 0.0)
     pulled = replace(calibration, fit=replace(fit, zernike_offset=fit.zernike_offset + bowl))
     shift = 4.0 * 12e-6 / calibration.aperture_radius**2
-    assert low + shift > 0.0 and curvatures(pulled) == pytest.approx((low + shift, high + shift), abs=2e-3)
+    assert low + shift > 0.0 and spheres(pulled) == pytest.approx((low + shift, high + shift, predicted), abs=2e-3)
 
 
 def test_every_coefficient_of_a_sphere_in_the_range_can_be_reached(calibration: Calibration) -> None:
     """A linear programme finds signals for the range told, and none for one that is 2 % wider."""
-    fit, (low, high) = calibration.fit, curvatures(calibration)
+    fit, (low, high, _predicted) = calibration.fit, spheres(calibration)
     terms, offset = fit.influence_zernike[3:] * 1e6, fit.zernike_offset[3:] * 1e6
     for curvature, within in ((low, True), (high, True), (1.02 * low, False), (1.02 * high, False)):
         wanted = 1e6 * conic_coefficients(curvature, 0.0, calibration.aperture_radius)[3:] - offset
         bounds = np.concatenate((wanted + 0.02, 0.02 - wanted))
         found = linprog(np.zeros(37), np.vstack((terms, -terms)), bounds, bounds=(fit.signal_min, fit.signal_max))
         assert found.success is within, curvature
+
+
+def test_what_few_actuators_leave_of_every_sphere_is_told(calibration: Calibration) -> None:
+    """Without the outer ring no signals make all coefficients right."""
+    fit, inner = calibration.fit, np.arange(37) < 19
+    few = replace(fit, influence_zernike=fit.influence_zernike * inner, influence_sag=fit.influence_sag * inner)
+    assert spheres(calibration)[2] < 1e-9
+    low, high, predicted = spheres(replace(calibration, fit=few))
+    assert low < high and 1e-9 < predicted < 20e-9
 
 
 def test_a_calibration_made_of_old_maps_is_no_longer_valid_for_that(calibration: Calibration) -> None:
@@ -156,7 +166,7 @@ def test_a_figure_that_asks_too_much_of_neighbours_does_not_put_flat_out_of_reac
     bump = replace(fit, zernike_offset=0.25 * fit.influence_zernike[:, 0], sag_offset=0.25 * fit.influence_sag[:, 0])
     applied = np.zeros_like(calibration.maps.applied)
     applied[:, 0] = 0.2
-    low, high = curvatures(replace(calibration, fit=bump, maps=replace(calibration.maps, applied=applied)))
+    low, high, _predicted = spheres(replace(calibration, fit=bump, maps=replace(calibration.maps, applied=applied)))
     assert low < -0.01 and high > 0.01
 
 

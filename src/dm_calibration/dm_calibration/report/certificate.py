@@ -29,6 +29,8 @@ from dm_common.optics.zernike import PISTON_TILT
 PEOPLE = Path("~/.ros/dm_report.json")
 #: A curvature is in the range while no coefficient is further off than this, m; it is found to this, 1/m.
 TOLERANCE, STEP = 20e-9, 1e-4
+#: So many spheres over the range tell what is predicted of most.
+SPHERES = 11
 #: Weight of the signals beside the coefficients, relative: makes the signals of more actuators than terms definite.
 RIDGE = 1e-9
 
@@ -52,9 +54,11 @@ def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
         write_whole(file.expanduser(), json.dumps(people(file) | dict(names)).encode())
 
 
-def curvatures(calibration: Calibration) -> tuple[float, float]:
+def spheres(calibration: Calibration) -> tuple[float, float, float]:
     """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach whatever the actuators went
-    through before; (nan, nan) = neither 0 nor that in mid range.
+    through before, and the largest coefficient error (m) that is predicted of one of them, in the median.
+
+    (nan, nan, nan) where neither 0 nor the curvature in mid range is reached.
     """
     fit, maps, radius = calibration.fit, calibration.maps, calibration.aperture_radius
     pairs = neighbour_pairs(calibration.actuator_x, calibration.actuator_y)
@@ -65,13 +69,15 @@ def curvatures(calibration: Calibration) -> tuple[float, float]:
     terms, offset = fit.influence_zernike[PISTON_TILT:], fit.zernike_offset[PISTON_TILT:]
     programme = BoundedProgramme(terms, limits, RIDGE * float(np.square(terms).sum()))
 
-    def reached(curvature: float) -> bool:
+    def error(curvature: float) -> float:
         wanted = conic_coefficients(curvature, 0.0, radius)[PISTON_TILT:] - offset
-        return bool(np.abs(terms @ programme.solve(wanted) - wanted).max() <= TOLERANCE)
+        return float(np.abs(terms @ programme.solve(wanted) - wanted).max())
 
     middle = 4.0 / radius**2 * float(offset[0] + limits.middle * terms[0].sum())
     stroke = 4.0 / radius**2 * (limits.high - limits.low) * float(np.abs(terms[0]).sum())
-    return reachable_range(reached, middle, stroke, STEP)
+    low, high = reachable_range(lambda curvature: error(curvature) <= TOLERANCE, middle, stroke, STEP)
+    over = np.linspace(low, high, SPHERES) if np.isfinite(low) else ()
+    return low, high, float(np.median([error(curvature) for curvature in over] or np.nan))
 
 
 def certificate(
@@ -91,16 +97,18 @@ def certificate(
     """
     reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]
     bound = length(calibration.promise, calibration.wavelength)
-    low, high = curvatures(calibration)
+    low, high, predicted = spheres(calibration)
     until, reason = valid_until(checks, calibration.promise, calibration.stamp_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
+    middle = f"largest coefficient error of a sphere {length(predicted, calibration.wavelength)} in the middle"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach if np.isfinite(low) else "neither flat nor mid range is within reach"),
-        ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
+        ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"),
+        ("predicted", f"{middle}, up to {TOLERANCE * 1e9:.0f} nm at the ends" if np.isfinite(low) else middle),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
@@ -111,8 +119,8 @@ def certificate(
     ]
     sentence = (
         f"This mirror is {'approximately ' if reasons else ''}calibrated: without a sensor in the loop, 95 % of its "
-        f"moves to a sphere in the range below are promised to end within {bound} of it in every Zernike coefficient "
-        "beyond tilt."
+        f"moves to a sphere in the range below are promised to end within {bound} of what is predicted in every "
+        "Zernike coefficient beyond tilt."
     )
     if since:
         sentence += " That is as it was measured; ./dm status says what holds since then."

@@ -112,7 +112,7 @@ def show_result(result: Any, calibration: Any = None) -> None:
         expected = result.expected_max_zernike
         beforehand = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
         console.print(
-            f"promise: {promised} for the largest coefficient, from "
+            f"promise: {promised} for the largest coefficient beyond what is predicted, from "
             f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{beforehand}; hysteresis "
             f"{result.hysteresis_model}"
         )

@@ -109,8 +109,8 @@ def _promise(capabilities: Any) -> str:
     if capabilities.error_code:
         return f"none now: {capabilities.message}"
     return (
-        f"largest coefficient within {promise(capabilities.error_bound)} and what creep adds, from "
-        f"{capabilities.curvature_min:+.4f} to {capabilities.curvature_max:+.4f} 1/m; each move says its own"
+        f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
+        f"from {capabilities.curvature_min:+.4f} to {capabilities.curvature_max:+.4f} 1/m; each move says its own"
     )
 
 

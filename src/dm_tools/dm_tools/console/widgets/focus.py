@@ -109,7 +109,7 @@ class FocusCard:
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
         self._text.show(
             f"Reachable {found[0]:+.4f} to {found[1]:+.4f} 1/m ({2 * found[0]:+.3f} to {2 * found[1]:+.3f} dioptre).\n"
-            f"95 % bound on a coefficient: {capabilities.error_bound * 1e9:.1f} nm{extra}."
+            f"95 % bound on a coefficient beyond what is predicted: {capabilities.error_bound * 1e9:.1f} nm{extra}."
         )
         if found != self._range:
             self._range = found
