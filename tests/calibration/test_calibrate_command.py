@@ -17,7 +17,8 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
 from typer.testing import CliRunner
 
-from dm_bringup.suite import ConfigError, load_config
+from dm_bringup.sections import ConfigError
+from dm_bringup.suite import load_config
 from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.procedure.forecast import GoodEnough

@@ -359,6 +359,10 @@ def test_another_folder_or_name_takes_effect_with_the_next_activation(
     activate("a")  # nothing changed: what is in use stays
     activate("c", calibration_folder=str(tmp_path / "other"), load_on_start="newest")
     activate("c", load_on_start="")
+    activate("c", calibration_folder="")
+    assert not node.active and "calibration_folder is empty" in node.inactive()
+    activate("c", calibration_folder=str(tmp_path / "other"))
+    assert node.active
     sent: list[Any] = []  # what others judge by reaches them at once
     monkeypatch.setattr(node._publisher, "publish", sent.append)
     assert node.set_parameters([Parameter("aperture_tolerance", value=0.05)])[0].successful

@@ -43,7 +43,7 @@ def test_added_terms_go_by_the_names_that_measure_prints() -> None:
     )
 
 
-@pytest.mark.parametrize("text", ["coma=5", "coma sin", "coma sin=x", ""])
+@pytest.mark.parametrize("text", ["coma=5", "coma sin", "coma sin=x", "", "coma sin=5, coma sin=-5"])
 def test_terms_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=f"zernike = {text!r}"):
         terms_of(text)

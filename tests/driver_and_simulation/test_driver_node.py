@@ -94,7 +94,7 @@ class Driver:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.observer.call(ChangeState, "pdm_driver/change_state", request).success)
 
-    def set_parameter(self, name: str, value: str) -> str:
+    def set_parameter(self, name: str, value: Any) -> str:
         """Set a parameter; the reason why it was refused, "" = it was not."""
         change = Parameter(name, value=value).to_parameter_msg()
         request = SetParameters.Request(parameters=[change])
@@ -407,6 +407,17 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     # Straight from active to finalized: the safe shape again.
     assert driver.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     wait_until(lambda: signals_of(unit.frames[-1:])[0] == pytest.approx(-1.0, abs=CODE), what="safe shape")
+
+
+def test_another_state_period_holds_at_once(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
+    start("dm_driver", "pdm_driver", parameters(unit, autostart=False))
+    driver = Driver(observer, unit)
+    for period in (60.0, 0.05):
+        assert driver.set_parameter("state_period", period) == ""
+        assert driver.change(Transition.TRANSITION_CONFIGURE)
+        assert driver.change(Transition.TRANSITION_CLEANUP)
+    before = len(driver.states)
+    wait_until(lambda: len(driver.states) > before + 10, 20, "states in the new period")
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,12 @@ def test_virtual_mirrors_share_neither_ports_nor_folders() -> None:
         assert str(config["virtual_bench"]["trigger.port"]) in config["interferometer"]["trigger_command"]
 
 
+def test_a_virtual_mirror_of_another_seed_is_no_mirror_that_was_calibrated() -> None:
+    first, second = (configurations([], names)["left"] for names in (["left", "right"], ["right", "left"]))
+    assert first["virtual_bench"]["seed"] != second["virtual_bench"]["seed"]
+    assert first["pdm_driver"]["mirror.serial"] != second["pdm_driver"]["mirror.serial"]
+
+
 def test_one_mirror_is_as_shipped() -> None:
     assert list(configurations([], [""]).values()) == list(configurations([], ["a"]).values())
 
@@ -55,6 +61,35 @@ def test_a_camera_comes_with_an_autofocus_that_knows_its_optics(tmp_path: Path) 
 def test_what_does_not_fit_is_refused(tmp_path: Path, files: int, names: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         configurations([tmp_path / "config.yaml"] * files, names)
+
+
+@pytest.mark.parametrize(
+    ("node", "values", "words"),
+    [
+        ("calibration", {"calibration_folder": "/data"}, "mirror.serial, calibration_folder = A, /data"),
+        ("pdm_driver", {"electronics.address": "10.0.0.7"}, "electronics.address:electronics.port = 10.0.0.7:12340"),
+        ("pdm_driver", {"electronics.serial_port": "/dev/ttyUSB0"}, "electronics.serial_port = /dev/ttyUSB0"),
+        ("interferometer", {"watch_folder": "/data/maps"}, "watch_folder = /data/maps"),
+        ("virtual_bench", {"trigger.port": 4321}, "virtual_bench trigger.port = 4321"),
+    ],
+)
+def test_mirrors_do_not_share_what_each_needs(
+    tmp_path: Path, node: str, values: dict[str, str | int], words: str
+) -> None:
+    mirrors = configurations([], ["left", "right"])
+    for config in mirrors.values():
+        config["pdm_driver"]["mirror.serial"] = "A"  # two of one serial can be told apart by their folders
+    files = [tmp_path / f"{name}.yaml" for name in mirrors]
+    for file, config in zip(files, mirrors.values(), strict=True):
+        save_config(config, file)
+    assert configurations(files, ["left", "right"]) == mirrors
+    for file, config in zip(files, mirrors.values(), strict=True):
+        config[node] |= values
+        if "electronics.address" in values:
+            config[node]["electronics.port"] = 12340
+        save_config(config, file)
+    with pytest.raises(ValueError, match=f"^{words} in the parameter files of left and right: each mirror needs one"):
+        configurations(files, ["left", "right"])
 
 
 def test_a_template_that_nobody_has_filled_in_is_refused() -> None:

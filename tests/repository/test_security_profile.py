@@ -167,6 +167,23 @@ def test_a_private_key_that_others_may_read_and_a_policy_that_was_changed(tmp_pa
     assert CliRunner().invoke(app, ["security", "--check", str(folder)]).exit_code == 1
 
 
+def test_two_mirrors_share_a_keystore(tmp_path: Path) -> None:
+    profiles = [Profile(), Profile("left"), Profile("left/upper"), Profile("right")]
+    files = [write_profile(profile, tmp_path) for profile in profiles]
+    shared = {tmp_path / "enclaves" / "governance.xml"}
+    for profile, own in zip(profiles, files, strict=True):
+        assert not ({*own} - shared) & {path for others in files if others is not own for path in others}
+        for enclave in profile.enclaves():
+            signed(tmp_path, profile, enclave)
+    for profile in profiles:
+        assert check_keystore(tmp_path, profile) == [] and keys_missing(tmp_path, profile) == []
+    assert "/policies/left/cli.policy.xml" in (tmp_path / "left" / "environment.sh").read_text()
+    cli = tmp_path / "enclaves" / "dm" / "left" / "cli"
+    cli.rename(cli.with_name("nobody"))
+    found = [check_keystore(tmp_path, profile) for profile in profiles]
+    assert [len(each) for each in found] == [0, 1, 0, 0] and "an enclave that no node of this" in found[1][0]
+
+
 def test_policies_have_the_form_that_sros2_reads(tmp_path: Path) -> None:
     """The rules of sros2's policy.xsd (version 0.2.0) that a generated file could break."""
     for path in write_profile(PROFILE, tmp_path):

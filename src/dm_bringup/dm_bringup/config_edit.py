@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from dm_bringup.suite import ConfigError, flat
+from dm_bringup.sections import EVERY, ConfigError, belongs, flat, read_yaml, values_in
 
 Changes = Mapping[str, Mapping[str, Any]]
 
@@ -17,27 +17,30 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
     the order of `changes`. In a file with sections of several mirrors they are those of the mirror in `namespace`.
 
     Raises:
-        ConfigError: the text has a form that cannot be changed so; nothing is lost by an edit.
+        ConfigError: the text has a form that cannot be changed so, or a later section overrules a change. Nothing is
+            lost by an edit.
     """
-    expected = _sections(text)
+    expected, namespace = _sections(text), namespace.strip("/")
     for node, values in changes.items():
-        key = _key(expected, node, namespace.strip("/"))
+        key = _key(expected, node, namespace)
         expected[key] = expected.get(key, {}) | dict(values)
         for name, value in reversed(list(values.items())):  # each new one goes before those that are there
             text = _with_value(text, key, name, value)
     if _sections(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
+    for node in changes:
+        values_in(expected, node, namespace)
     return text
 
 
 def _key(keys: Collection[str], node: str, namespace: str) -> str:
-    """The section for what concerns one mirror: its own, also a new one where it has some, before that of all."""
-    places = {key: key.rpartition("/")[0].strip("/") for key in keys}
-    of_node = [key for key in keys if _node_name(key) == node]
-    own = [key for key in of_node if "*" not in key and (not namespace or places[key] in ("", namespace))]
-    if not own and namespace and namespace in places.values():
+    """The section for what concerns one mirror: its own, also a new one where it names namespaces, else of all."""
+    of_node = [key for key in keys if _node_name(key) == node and belongs(key, namespace)]
+    if own := [key for key in of_node if "*" not in key]:
+        return own[0]
+    if namespace and any({*key.split("/")[:-1]} - {"", "*", EVERY} for key in keys):  # others may read what is of all
         return f"/{namespace}/{node}"
-    return (own or [key for key in of_node if "*" in key] or [f"/**/{node}"])[0]
+    return (of_node or [f"/**/{node}"])[-1]
 
 
 def _with_value(text: str, key: str, name: str, value: Any) -> str:
@@ -74,7 +77,7 @@ def values_of(text: str) -> dict[str, dict[str, Any]]:
 
 def _sections(text: str) -> dict[str, dict[str, Any]]:
     try:
-        content = yaml.safe_load(text) or {}
+        content = read_yaml(text) or {}
         return {str(key): flat(section["ros__parameters"]) for key, section in content.items()}
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"not a parameter file: {type(error).__name__}: {error}") from error

@@ -182,11 +182,11 @@ def remapping(rule: str) -> tuple[str, str]:
     return old, new
 
 
-def number(name: str, text: str) -> float:
+def number(name: str, text: Any) -> float:
     """Raises ValueError for what is none."""
     try:
         return float(text)
-    except ValueError:
+    except (TypeError, ValueError):
         raise ValueError(f"{name}: {text!r}: must be a number") from None
 
 

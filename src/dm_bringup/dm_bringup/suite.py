@@ -14,6 +14,7 @@ from typing import Any, NoReturn, Self
 import yaml
 
 from dm_bringup.nodes import MODULES, NAMES, nodes_of, remapping
+from dm_bringup.sections import EVERY, ConfigError, belongs, flat, read_yaml, values_in
 from dm_common.ros import SUPERVISOR
 
 Config = dict[str, dict[str, Any]]
@@ -27,10 +28,6 @@ NOT_MADE = 1
 AS_STARTED = "as_started.yaml"
 
 
-class ConfigError(ValueError):
-    """The configuration file cannot be used; the message says where and why."""
-
-
 def load_config(path: Path, namespace: str = "") -> Config:
     """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError when it is none, or cannot be read.
 
@@ -38,39 +35,32 @@ def load_config(path: Path, namespace: str = "") -> Config:
         namespace: of the nodes, without slashes around it; sections of other namespaces do not count. "" = any.
     """
     try:
-        content = yaml.safe_load(path.read_text())
+        content = read_yaml(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not a YAML file in UTF-8: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
-    result: Config = {}
-    own, of_all = set[str](), dict[str, Any]()
-    for key, section in content.items():
-        place, _, name = str(key).rpartition("/")
-        prefix, below, _ = place.partition("*")
-        prefix = prefix.strip("/")
-        if namespace and prefix not in ("", namespace) and not (below and namespace.startswith(f"{prefix}/")):
+    sections: Config = {}
+    for key, section in ((str(key), section) for key, section in content.items()):
+        name = key.rpartition("/")[2]
+        if not belongs(key, namespace):
             continue
-        if name not in NAMES and name != "**":
+        if name not in NAMES and name != EVERY:
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
-        values = _readable(f"{path}: {key}", flat(section["ros__parameters"]))
-        if name == "**":
-            of_all |= values
-            continue
-        if "*" in place:  # of every mirror: what a section of its own says counts, as to ROS
-            result[name] = values | result.get(name, {})
-            continue
-        if name in own:
+        if any("*" not in other + key and other.rpartition("/")[2] == name for other in sections):
             raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or chosen by --namespace")
-        own.add(name)
-        result[name] = result.get(name, {}) | values
-    if of_all:  # also for nodes that run without a section of their own
-        result = {node.name: result.get(node.name, {}) for node in nodes_of(result)}
-    return {name: of_all | values for name, values in result.items()}
+        sections[key] = _readable(f"{path}: {key}", flat(section["ros__parameters"]))
+    named = {key.rpartition("/")[2] for key in sections}
+    if EVERY in named:  # also for nodes that run without a section of their own
+        named = {node.name for node in nodes_of(named)}
+    try:
+        return {name: values_in(sections, name, namespace) for name in NAMES if name in named}
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -87,14 +77,6 @@ def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
         if len(kinds) > 1:
             text = 'must be of one type, as 0.0 and 2.5, or "--port" and "12"'
             raise ConfigError(f"{section}: {name} = {value}: {text}")
-    return found
-
-
-def flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The parameters of a section by their names: `mirror: {serial: A}` is `mirror.serial: A` to ROS."""
-    found: dict[str, Any] = {}
-    for name, value in section.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return found
 
 

@@ -29,6 +29,7 @@ from dm_bringup.nodes import (
     namespace_of,
     node_environment,
     nodes_of,
+    number,
 )
 from dm_bringup.suite import load_config
 from launch import LaunchDescription
@@ -59,7 +60,7 @@ def start_nodes(context):
             actions += brought_up(action)
         actions.append(action)
     aggregation = Path(get_package_share_directory("dm_bringup")) / "launch" / "diagnostics.yaml"
-    camera = config.get("virtual_bench", {}).get("camera.rate", 0.0) > 0.0
+    camera = number("virtual_bench: camera.rate", config.get("virtual_bench", {}).get("camera.rate", 0.0)) > 0.0
     companions = companions_of(values, aggregation, camera, pushed)
     return actions + [Node(output="screen", **others) for others in companions]
 

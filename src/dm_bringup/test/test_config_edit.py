@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from dm_bringup.config_edit import edited, values_of
-from dm_bringup.suite import ConfigError
+from dm_bringup.sections import ConfigError, values_in
 
 FILE = Path(__file__).parents[1] / "config" / "hardware.yaml"
 CHANGES = {
@@ -19,6 +19,10 @@ CHANGES = {
 
 def values(text: str) -> dict[str, dict[str, object]]:
     return {key.rsplit("/", 1)[-1]: part["ros__parameters"] for key, part in yaml.safe_load(text).items()}
+
+
+def sections(text: str) -> dict[str, dict[str, object]]:
+    return {key: part["ros__parameters"] for key, part in yaml.safe_load(text).items()}
 
 
 def test_comments_and_all_other_lines_stay() -> None:
@@ -73,10 +77,32 @@ def test_of_two_mirrors_in_a_file_one_changes() -> None:
     for node, values in CHANGES.items():
         before.setdefault(f"/right/{node}", {}).setdefault("ros__parameters", {}).update(values)
     assert after == before
-    assert "/**/interferometer:" in edited(text, CHANGES, "third"), "it has no section of its own"
+    assert values_in(sections(edited(text, CHANGES, "third")), "pdm_driver", "third") == {
+        "a": 1,
+        **CHANGES["pdm_driver"],
+    }
     assert yaml.safe_load(edited(text, CHANGES, "third"))["/**/pdm_driver"]["ros__parameters"]["a"] == 1
     other = "/left/interferometer: {ros__parameters: {b: 1}}\n"
     assert edited(f"{other}/**/pdm_driver: {{ros__parameters: {{a: 1}}}}\n", CHANGES, "third").startswith(other)
+
+
+@pytest.mark.parametrize("others", ["/left/**/", "/left/*/", "/left/", "/**/left/"])
+@pytest.mark.parametrize(
+    "of_all", ["", "/**/interferometer: {ros__parameters: {b: 1}}\n", "/left/**: {ros__parameters: {b: 1}}\n"]
+)
+def test_what_is_found_of_one_mirror_does_not_reach_another(others: str, of_all: str) -> None:
+    text = of_all + "".join(f"{others}{node}: {{ros__parameters: {{a: 1}}}}\n" for node in CHANGES)
+    before, after = sections(text), sections(edited(text, CHANGES, "right"))
+    for node, values in CHANGES.items():
+        assert values.items() <= values_in(after, node, "right").items()
+        for namespace in ("left", "left/upper", "third"):
+            assert values_in(after, node, namespace) == values_in(before, node, namespace)
+
+
+def test_a_change_that_a_later_section_would_overrule_is_refused() -> None:
+    text = "/left/pdm_driver: {ros__parameters: {a: 1}}\n/**: {ros__parameters: {mirror.wiring: trihex}}\n"
+    with pytest.raises(ConfigError, match=r"mirror\.wiring: 'trihex' overrules 'custom' of /left/pdm_driver"):
+        edited(text, CHANGES, "left")
 
 
 def test_what_is_no_parameter_file_is_refused() -> None:

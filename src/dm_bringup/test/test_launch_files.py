@@ -15,7 +15,8 @@ import pytest
 import yaml
 
 from dm_bringup.nodes import HELD_SIGNALS, LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, companions_of, nodes_of
-from dm_bringup.suite import ConfigError, load_config
+from dm_bringup.sections import ConfigError
+from dm_bringup.suite import load_config
 
 SHARE = Path(__file__).resolve().parents[1]
 
@@ -92,6 +93,11 @@ def test_launch_files_start_what_up_starts(
     assert asks(None) and goes_on(refused) == [] and goes_on(done) == []
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
+    for rate in ('"fast"', "[30.0]"):
+        wrong = tmp_path / "wrong.yaml"
+        wrong.write_text(f"/**/virtual_bench: {{ros__parameters: {{camera.rate: {rate}}}}}\n")
+        with pytest.raises(ValueError, match=r"virtual_bench: camera\.rate: .*: must be a number"):
+            start_nodes(DEFAULTS | {"config": str(wrong)})
 
 
 def test_a_signal_waits_until_a_node_has_imported_what_it_needs(domain: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -11,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
+import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
 from dm_bringup import suite as suite_module
-from dm_bringup.suite import RESTART_S, ConfigError, Suite, load_config, save_config
+from dm_bringup.sections import ConfigError
+from dm_bringup.suite import RESTART_S, Suite, load_config, save_config
 from dm_common.ros.domains import own_domain
 
 
@@ -92,14 +96,56 @@ def test_groups_of_parameters_are_names_and_two_mirrors_are_two_files(tmp_path: 
     with pytest.raises(ConfigError, match="/right/pdm_driver: a second section of pdm_driver"):
         load_config(file)
     assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0}}
-    with file.open("a") as lines:
-        lines.write("/**/pdm_driver: {ros__parameters: {volts.max: 200.0, simple: 2}}\n")
+    of_all = "/**/pdm_driver: {ros__parameters: {volts.max: 200.0, simple: 2}}\n"
+    file.write_text(of_all + file.read_text())
     assert load_config(file, "right") == {"pdm_driver": {"volts.max": 300.0, "simple": 2}}
     file.write_text("/left/**/pdm_driver: {ros__parameters: {simple: 1}}\n")  # of nodes below /left only
     assert load_config(file, "left") and load_config(file, "left/upper") and not load_config(file, "right")
+    section = "/**/pdm_driver: {ros__parameters: {volts.max: 300.0}}\n"
+    file.write_text(f"{section}{section}")  # ROS takes both, YAML the last
+    with pytest.raises(ConfigError, match=r"/\*\*/pdm_driver comes twice"):
+        load_config(file)
     file.write_text("# 3 µm\n", encoding="latin-1")  # as some editors of Windows do
     with pytest.raises(ConfigError, match=r"config\.yaml: not a YAML file in UTF-8"):
         load_config(file)
+
+
+@pytest.mark.parametrize("namespace", ["left", "right", "left/upper", "lab/left"])
+def test_sections_count_as_they_do_to_ros(tmp_path: Path, namespace: str) -> None:
+    file = tmp_path / "config.yaml"
+    places = ("/**", "/**/pdm_driver", "/*/pdm_driver", "/*/left/pdm_driver", "/**/left/pdm_driver", "/left/**")
+    keys = (*places, "/left/**/pdm_driver", "/left/pdm_driver", "/right/pdm_driver", "/lab/left/pdm_driver")
+    # The same name in each, the last of a kind counts; and one that tells whether the section is taken.
+    save = {key: {"ros__parameters": {"mirror.serial": key, f"of{place}": 1}} for place, key in enumerate(keys)}
+    ordered = sorted(save, key=lambda key: (not key.endswith("**"), "*" not in key))
+    file.write_text(yaml.safe_dump({key: save[key] for key in ordered}, sort_keys=False))
+    context = Context()
+    rclpy.init(args=["--ros-args", "--params-file", str(file), "-r", f"__ns:=/{namespace}"], context=context)
+    try:
+        node = rclpy.create_node("pdm_driver", context=context)
+        to_ros = {name: given.value for name, given in node._parameter_overrides.items()}
+        node.destroy_node()
+    finally:
+        context.shutdown()
+    assert load_config(file, namespace)["pdm_driver"] == to_ros
+
+
+@pytest.mark.parametrize("general", ["/**", "/**/pdm_driver"])
+def test_a_general_section_that_would_overrule_a_particular_one_is_refused(tmp_path: Path, general: str) -> None:
+    file = tmp_path / "config.yaml"
+    own, of_all = (
+        f"{key}: {{ros__parameters: {{volts.max: {volts}}}}}\n"
+        for key, volts in (("/left/pdm_driver", 100.0), (general, 300.0))
+    )
+    file.write_text(of_all + own)
+    assert load_config(file, "left")["pdm_driver"] == {"volts.max": 100.0}
+    file.write_text(own + of_all)
+    text = (
+        f"{general}: volts.max: 300.0 overrules 100.0 of /left/pdm_driver, for the last counts: put {general} before it"
+    )
+    with pytest.raises(ConfigError, match=re.escape(text)):
+        load_config(file, "left")
+    assert load_config(file, "right")["pdm_driver"] == {"volts.max": 300.0}
 
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:

@@ -87,6 +87,8 @@ class CalibrationNode(ManagedNode):
             self._manager.publish_again()  # others judge by them
 
     def configure(self) -> None:
+        if not self._values["calibration_folder"]:
+            raise ValueError("calibration_folder is empty: must name a folder")  # it would be where the node started
         folder = Path(self._values["calibration_folder"]).expanduser()
         if folder != self._manager.store.folder:
             self.clean_up()  # what is in use is not in the new folder

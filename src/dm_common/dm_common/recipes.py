@@ -127,18 +127,20 @@ def terms_of(text: str) -> list[float]:
     """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names of SPOKEN.
 
     Raises:
-        ValueError: naming what is no term, or no number.
+        ValueError: naming what is no term, or no number, or comes twice.
     """
-    terms = dict.fromkeys(SPOKEN, 0.0)
+    terms: dict[str, float] = {}
     for part in text.split(","):
         name, _, value = (each.strip() for each in part.partition("="))
-        if name not in terms:
+        if name in terms:
+            raise ValueError(f"zernike = {text!r}: {name} comes twice: must be given once")
+        if name not in SPOKEN:
             raise ValueError(f"zernike = {text!r}: must be like 'coma sin=-50'; terms: {', '.join(SPOKEN)}")
         try:
             terms[name] = 1e-9 * float(value)
         except ValueError as error:
             raise ValueError(f"zernike = {text!r}: {value!r} is not a number of nm") from error
-    return list(terms.values())
+    return [terms.get(name, 0.0) for name in SPOKEN]
 
 
 def shape_text(shape: Any) -> str:

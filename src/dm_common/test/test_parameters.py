@@ -173,6 +173,10 @@ def test_a_lifecycle_node_is_put_right_before_it_is_configured(observer: Observe
     refused = node.set_parameters([RosParameter("serial", value="S2")])[0]
     assert "not configured" in refused.reason and values["serial"] == "S1"
     assert node.set_parameters([RosParameter("gain", value=5.0)])[0].successful
+    # `ros2 param load` of a dump: what stays as it is may be set.
+    dumped = {name: given for name, given in get_all(node).items() if name in values} | {"gain": 6.0}
+    loaded = [RosParameter(name, value=given) for name, given in dumped.items()]
+    assert node.set_parameters_atomically(loaded).successful and values["gain"] == 6.0
     node.destroy_node()
 
 

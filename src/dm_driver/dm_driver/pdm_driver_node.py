@@ -79,6 +79,7 @@ class PdmDriverNode(ManagedNode):
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
+        self._timer.reset()  # else the period that has begun goes on, a minute perhaps
         self._gate.configuration = configuration
         self._gate.refusal, self._gate.trouble = None, ""
         self._gate.writer = ActuatorWriter(

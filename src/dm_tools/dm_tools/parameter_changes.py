@@ -54,7 +54,8 @@ def source_of(target: Path, config: Path | None, serial: str, namespace: str = "
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
     """
-    from dm_bringup.suite import ConfigError, load_config
+    from dm_bringup.sections import ConfigError
+    from dm_bringup.suite import load_config
     from dm_tools.verbs.up import shared_config
 
     source = config or (target if target.exists() else shared_config("bench.yaml"))

@@ -201,11 +201,13 @@ def declare(
             for change in changes:
                 if (parameter := by_name.get(change.name)) is None:
                     continue
-                if not (parameter.live or unlocked is None or unlocked()):
+                value = parameter.check(change.value)
+                # One as it was may be set at any time: `ros2 param load` of a dump sets all that there are.
+                if not (parameter.live or unlocked is None or unlocked() or value == values[change.name]):
                     state = "configured" if unlock == "cleanup" else "active"
                     command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {unlock}"
                     raise ParameterError(f"{change.name} changes only while the node is not {state}: `{command}` first")
-                check({change.name: parameter.check(change.value)})
+                check({change.name: value})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
-from dm_bringup.suite import Config, ConfigError, load_config
+from dm_bringup.sections import ConfigError
+from dm_bringup.suite import Config, load_config
 from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree as xml
 
-from dm_tools.security.policy import ROOT, Profile, dds_topics, governance_xml, policy_xml
+from dm_tools.security.policy import Profile, dds_topics, governance_xml, policy_xml
 
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
@@ -17,14 +17,14 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
     found: list[str] = []
     enclaves = profile.enclaves()
     for enclave in enclaves:
-        found += _compare_text(folder / "policies" / f"{enclave}.policy.xml", policy_xml(profile, enclave))
+        found += _compare_text(profile.policy(folder, enclave), policy_xml(profile, enclave))
     found += _compare_text(folder / "enclaves" / "governance.xml", governance_xml(profile))
     expected = {profile.path(enclave).lstrip("/") for enclave in enclaves}
     for path in sorted((folder / "enclaves").rglob("permissions.xml")):
         place = path.parent.relative_to(folder / "enclaves").as_posix()
         if place in expected:
             found += _check_permissions(path, profile, place.rsplit("/", 1)[-1])
-        elif place.startswith(f"{ROOT.lstrip('/')}/"):
+        elif place.rpartition("/")[0] == profile.path("").strip("/"):  # others are of other mirrors
             found.append(f"{path}: an enclave that no node of this profile has")
     for path in sorted(folder.rglob("*.pem")):
         if path.name.endswith("key.pem") and path.stat().st_mode & _OTHERS:

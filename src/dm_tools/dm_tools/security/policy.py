@@ -70,6 +70,14 @@ class Profile:
         """Path of an enclave."""
         return f"{ROOT}{self.ns.rstrip('/')}/{enclave}"
 
+    def folder(self, keystore: Path) -> Path:
+        """What the keystore has of this mirror alone, but for its enclaves."""
+        return keystore / self.ns.strip("/")
+
+    def policy(self, keystore: Path, enclave: str) -> Path:
+        """Where the policy of an enclave lies."""
+        return self.folder(keystore / "policies") / f"{enclave}.policy.xml"
+
     def enclaves(self) -> dict[str, list[NodeInterface]]:
         """The nodes of each enclave, by its last part."""
         found: dict[str, list[NodeInterface]] = {}
@@ -148,7 +156,7 @@ def environment(profile: Profile, keystore: Path) -> str:
         f"#   ros2 security create_keystore {store}",
     ]
     for enclave in profile.enclaves():
-        path, file = profile.path(enclave), keystore / "policies" / f"{enclave}.policy.xml"
+        path, file = profile.path(enclave), profile.policy(keystore, enclave)
         lines.append(f"#   ros2 security create_enclave {store} {path}")
         lines.append(f"#   ros2 security create_permission {store} {path} {shlex.quote(str(file))}")
     lines += ["", "# Each process its own enclave, by the environment: all its nodes belong to it then."]
@@ -157,13 +165,14 @@ def environment(profile: Profile, keystore: Path) -> str:
 
 
 def write_profile(profile: Profile, folder: Path) -> list[Path]:
-    """Write policies, governance and environment into a keystore's folder; returns the files. Raises OSError."""
+    """Write policies, governance and environment into a keystore's folder; returns the files. Raises OSError.
+
+    What others have there, of mirrors in other namespaces, stays; the governance is of all.
+    """
     folder = folder.absolute()
-    files = {
-        folder / "policies" / f"{enclave}.policy.xml": policy_xml(profile, enclave) for enclave in profile.enclaves()
-    }
+    files = {profile.policy(folder, enclave): policy_xml(profile, enclave) for enclave in profile.enclaves()}
     files[folder / "enclaves" / "governance.xml"] = governance_xml(profile)
-    files[folder / "environment.sh"] = environment(profile, folder)
+    files[profile.folder(folder) / "environment.sh"] = environment(profile, folder)
     private = folder / "private"
     private.mkdir(mode=0o700, parents=True, exist_ok=True)
     for path, content in files.items():

@@ -31,7 +31,7 @@ def security(
     if out is not None:
         files = write_profile(profile, out)
         console.print(f"{len(files)} files in {out}: one policy per enclave, governance, and environment.sh")
-        console.print("environment.sh says how to make the keys; see docs/security.md")
+        console.print(f"{profile.folder(out) / 'environment.sh'} says how to make the keys; see docs/security.md")
         write_json(json, {"security": {"files": [str(path) for path in files]}})
         return
     assert check is not None

@@ -184,8 +184,8 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
 
     Raises:
         ConfigError: a file cannot be used.
-        ValueError: the numbers do not match, a namespace comes twice, a section is missing, or a file has the say on
-            the camera.
+        ValueError: the numbers do not match, a namespace comes twice, a section is missing, mirrors share what each
+            needs for itself, or a file has the say on the camera.
     """
     from dm_tools.doctor.bench import own_values
 
@@ -206,7 +206,41 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
         if camera:
             add_camera(configuration)
         result[name] = configuration if files or len(names) == 1 else virtual_mirror(configuration, name, number)
+    if len(result) > 1:
+        check_apart(result)
     return result
+
+
+def check_apart(mirrors: Mapping[str, Config]) -> None:
+    """Raise ValueError where two mirrors have one unit, folder of maps, store of calibrations or port of a bench."""
+    users: dict[tuple[str, Any], str] = {}
+    for mirror, config in mirrors.items():
+        for thing in _own(config):
+            if (other := users.setdefault(thing, mirror)) != mirror:
+                text = f"{thing[0]} = {thing[1]} in the parameter files of {other} and {mirror}"
+                raise ValueError(f"{text}: each mirror needs one of its own")
+
+
+def _own(config: Config) -> Iterator[tuple[str, Any]]:
+    """What no other mirror may have, with the names of the parameters."""
+    from dm_tools.doctor.bench import effective, sound_values
+
+    values = {node: effective(node, sound_values(node, given)) for node, given in config.items()}
+    driver, bench = values["pdm_driver"], values.get("virtual_bench", {})
+    folder = effective("calibration", values.get("calibration", {}))["calibration_folder"]
+    yield (
+        "mirror.serial, calibration_folder",
+        f"{config['pdm_driver'].get('mirror.serial')}, {Path(folder).expanduser()}",
+    )
+    if port := driver["electronics.serial_port"]:
+        yield "electronics.serial_port", Path(port).expanduser()
+    elif driver["electronics.address"]:
+        yield "electronics.address:electronics.port", f"{driver['electronics.address']}:{driver['electronics.port']}"
+    if watched := values.get("interferometer", {}).get("watch_folder"):
+        yield "watch_folder", Path(watched).expanduser()
+    for name in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port", "trigger.port"):
+        if bench.get(name, 0) > 0:  # 0 = any that is free
+            yield f"virtual_bench {name}", bench[name]
 
 
 def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
@@ -219,7 +253,7 @@ def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
         simulation[key] += shift
     driver["electronics.port"] += shift
     simulation["seed"] += number
-    driver["mirror.serial"] = f"virtual-{name}"
+    driver["mirror.serial"] = f"virtual-{name}-{simulation['seed']}"  # by another seed it is another mirror
     folder = f"~/.ros/dm_bench/{name}"
     simulation["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
     own["calibration"]["calibration_folder"] = f"{folder}/calibrations"
