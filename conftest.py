@@ -99,6 +99,13 @@ TEST_BY_TEST = frozenset(
     }
 )
 _COMMAND = re.compile(r"\brun it with: (.+)$")
+_MARK = re.compile(r"(?m)^pytestmark = \[?pytest\.mark\.(\w+)")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Modules of which `-m` leaves nothing are not imported either."""
+    marked = _MARK.search(collection_path.read_text()) if collection_path.suffix == ".py" else None
+    return True if marked and f"not {marked[1]}" in config.getvalue("markexpr").split(" and ") else None
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` leaves out what it does not want

@@ -6,9 +6,11 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from markdown_it import MarkdownIt
+from markdown_it.token import Token
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -52,11 +54,16 @@ class Block:
         return [part.strip() for line in lines if line for part in line.split(" && ")]
 
 
+@cache
+def parsed(page: Path) -> list[Token]:
+    return MarkdownIt().enable("table").parse(page.read_text())
+
+
 def blocks() -> list[Block]:
     """All blocks of all pages."""
     found = []
     for page in PAGES:
-        for token in MarkdownIt().parse(page.read_text()):
+        for token in parsed(page):
             if token.type in ("fence", "code_block"):
                 assert token.map is not None
                 found.append(Block(page.name, token.map[0] + 1, token.content.rstrip("\n"), token.info.strip()))
@@ -66,7 +73,7 @@ def blocks() -> list[Block]:
 def inline_commands() -> Iterator[tuple[str, str]]:
     """(page, command) of every `./dm ...` within the text."""
     for page in PAGES:
-        for token in MarkdownIt().enable("table").parse(page.read_text()):
+        for token in parsed(page):
             for child in token.children or []:
                 if child.type == "code_inline" and child.content.startswith("./dm "):
                     yield page.name, child.content

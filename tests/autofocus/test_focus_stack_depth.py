@@ -14,6 +14,7 @@ from dm_simulation.camera import CameraConfig, SceneCamera, camera_matrix
 from studies.autofocus.stacks import depths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", [5000.0, 300.0])
 def test_distances_are_within_half_a_depth_of_focus(photons: float) -> None:
     for depth in depths(photons, step=4.0, distances=(5.5, 15.0, 30.0)):

@@ -108,6 +108,7 @@ def test_distortion_from_a_grid_of_marks(tmp_path: Path) -> None:
     assert error(file, truth, settings) < 0.3e-9 < 1e-9 < error(file, truth, SETTINGS)
 
 
+@pytest.mark.slow
 def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_path: Path) -> None:
     with bench(tmp_path, instrument_error=30e-9) as simulated:
         rows = ["file,reference,part,degrees", *(f"{simulated.measure()},A,B," for _ in range(2))]

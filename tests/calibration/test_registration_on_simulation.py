@@ -73,6 +73,7 @@ def settings_from(values: dict[str, object]) -> IngestSettings:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start_deg", "camera", "before"),
     [
@@ -110,6 +111,7 @@ def test_what_is_found_puts_it_right(
     assert second.registration.scale == pytest.approx(float(camera.get("mount_scale", 1.0)), abs=0.01)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_maps_that_do_not_tell_their_lateral_resolution_are_not_refused_with_the_cure() -> None:
     wiring = np.arange(37)
     mounted = MountedMirror(PlateConfig(), replace(CAMERA, mount_angle=0.5), wiring, tells_pitch=False)
@@ -123,6 +125,7 @@ def test_maps_that_do_not_tell_their_lateral_resolution_are_not_refused_with_the
     assert again.passed, again.findings
 
 
+@pytest.mark.slow
 def test_an_aperture_that_follows_the_mirror_does_so_with_the_cure() -> None:
     """Also when the mirror is put back beside its old place."""
     wiring = np.arange(37)

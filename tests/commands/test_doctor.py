@@ -205,6 +205,7 @@ def _raising(error: BaseException) -> list[tuple[str, int]]:
     return places
 
 
+@pytest.mark.slow
 def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
     """Each `raise ValueError` of the modules that configure is reached by a case above, or by no values at all."""
     reached = set()

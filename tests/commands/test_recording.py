@@ -229,6 +229,7 @@ def test_the_whole_law_is_compared() -> None:
     assert fields - set(COMPARED) == {f"hysteresis.{name}" for name in beside}
 
 
+@pytest.mark.slow
 def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path) -> None:
     bag, figures = run_and_bag[2], tmp_path / "figures.json"
     command = [sys.executable, "-m", "dm_tools", "replay", str(bag.path), "--recalibrate"]

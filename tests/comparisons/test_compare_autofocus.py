@@ -36,6 +36,7 @@ def test_a_scene_is_the_same_for_the_same_seed_and_sharpest_in_focus() -> None:
     assert np.abs(np.diff(first.astype(float))).mean() > np.abs(np.diff(dull.astype(float))).mean()
 
 
+@pytest.mark.slow
 def test_few_images_are_enough(capsys: pytest.CaptureFixture[str]) -> None:
     trials = [trial for seed in range(2000, 2006) for trial in run_scene(seed, methods=(OURS,))]
     figures = figures_of(trials)
@@ -48,6 +49,7 @@ def test_few_images_are_enough(capsys: pytest.CaptureFixture[str]) -> None:
     assert "few images" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_photograph_is_focused_like_what_is_drawn() -> None:
     scenes = [replace(draw_scene(seed), texture=PHOTOGRAPH, background=None) for seed in range(5000, 5006)]
     figures = figures_of([trial for scene in scenes for trial in run_drawn(scene, (OURS,))])
@@ -55,6 +57,7 @@ def test_a_photograph_is_focused_like_what_is_drawn() -> None:
     assert figures.within_one >= 0.8 and figures.gross == 0
 
 
+@pytest.mark.slow
 def test_a_photograph_is_focused_through_the_true_surface_of_a_calibrated_mirror() -> None:
     plate = Plate(820)
     images, errors = np.array([plate.search(number) for number in range(4)]).T

@@ -46,6 +46,7 @@ def test_a_seed_is_always_the_same_mirror_and_seeds_differ() -> None:
     assert 40e-9 <= figures.min() < figures.max() <= 500e-9
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("common_laws")
 def test_a_mirror_is_judged_and_its_figures_are_told() -> None:
     options = PopulationOptions(requests=5, maps=90, recipes=2, pixels=100)

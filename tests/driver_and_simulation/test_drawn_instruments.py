@@ -128,6 +128,7 @@ class DrawnInstrument:
         return table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_what_is_left_is_inside_the_absolute_bound(seed: int, tmp_path: Path) -> None:
     """Of the first 100 seeds 98 are, by a bound of 95 %."""

@@ -110,6 +110,7 @@ def test_illegal_signals_are_refused_and_move_nothing(bench: SimulatedBench) -> 
     np.testing.assert_array_equal(fork.true_map(), before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["none", "bouc_wen"])
 def test_a_calibration_finds_the_true_influence(law: str) -> None:
     bench = SimulatedBench(

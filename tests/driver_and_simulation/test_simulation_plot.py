@@ -9,6 +9,7 @@ import pytest
 from studies import simulation_plot
 
 
+@pytest.mark.slow
 def test_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "bench.png"
     options = ["--output", str(picture), "--poke", "37", "--law", "bouc_wen", "--curvature", "-0.02"]

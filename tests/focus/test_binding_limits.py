@@ -45,6 +45,7 @@ def written(signals: Floats) -> Floats:
     return np.clip(np.round((signals + 1.0) / DAC_STEP) * DAC_STEP - 1.0, -1.0, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("difference", [0.3, 0.5, 1.0, 1.5, 2.0])
 def test_what_is_published_as_reachable_is_planned_within_the_tolerance_and_the_driver_takes_it(
     difference: float,

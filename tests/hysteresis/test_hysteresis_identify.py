@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -175,11 +176,16 @@ def test_actuators_that_hardly_move_are_refused(rising: Run) -> None:
         identify(replace(rising, signals=signals))
 
 
+@cache
+def with_third(share: float) -> Identification:
+    """Own laws of a run in which the third actuator moves by `share` of what is asked."""
+    own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
+    return identify(*simulated_run("preisach", third=share), [LINEAR, PREISACH, own])
+
+
 @pytest.mark.parametrize("third", [0.0, 0.05])
 def test_one_actuator_that_hardly_moves_follows_the_law_of_the_others_and_is_named(third: float) -> None:
-    own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
-    laws = [LINEAR, PREISACH, own]
-    whole, found = (identify(*simulated_run("preisach", third=share), laws) for share in (1.0, third))
+    whole, found = with_third(1.0), with_third(third)
     assert held_out_rms(found) < 1.2 * held_out_rms(whole)
     assert slope_min(found.fit.law) > 0.5 and np.isfinite(found.fit.law.play_weight).all()
     assert not whole.quiet

@@ -18,6 +18,7 @@ from studies.paper.readings import Reading, regress_surface_errors
 from studies.paper.reported import TEST_SURFACES as TEST_SET
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["AZreg", "AZWreg"])
 def test_following_the_history_predicts_the_test_set(method: str) -> None:
     maps, fit = calibrated(method)
@@ -44,6 +45,7 @@ def test_following_the_history_predicts_the_test_set(method: str) -> None:
         assert table2.test_rms == pytest.approx(np.sqrt(np.mean(squares)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reading", list(Reading))
 def test_the_test_maps_have_no_say_in_their_prediction(reading: Reading) -> None:
     maps, fit = calibrated()
@@ -60,6 +62,7 @@ def test_the_test_maps_have_no_say_in_their_prediction(reading: Reading) -> None
         assert [row.predicted for row in after.table3] == pytest.approx([row.predicted for row in before.table3])
 
 
+@pytest.mark.slow
 def test_points_without_data_do_not_disturb() -> None:
     maps, fit = calibrated()
     sag = maps.sag.copy()

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ ALLOWED = {
 }
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Full names of all modules a file imports."""
     names = set()

@@ -26,7 +26,11 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(text: str) -> Any:
     """What a parameter file holds. Raises yaml.YAMLError."""
-    return yaml.load(text, _Loader)
+    loader = _Loader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 def belongs(key: str, namespace: str) -> bool:

@@ -142,6 +142,7 @@ def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
     assert missing.promise == pytest.approx(bound, rel=0.2)
 
 
+@pytest.mark.slow
 def test_arrays_of_commands_times_and_maps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -57,6 +57,7 @@ def test_whole_numbers_have_no_value_for_no_data(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_map(tmp_path / "a.datx").sag, [[1e-9, 2e-9], [3e-9, -4e-9]])
 
 
+@pytest.mark.slow
 def test_an_independent_reader_agrees(tmp_path: Path) -> None:
     """The file made here is legal: a program that shares nothing with this suite reads the same heights."""
     topography = pytest.importorskip("SurfaceTopography", reason=ORACLE_MISSING)

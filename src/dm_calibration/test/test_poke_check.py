@@ -64,6 +64,7 @@ def test_cycle_of_three() -> None:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.permutations(range(37)), st.integers(0, 1000))
 def test_any_wiring_is_found(order: list[int], seed: int) -> None:
@@ -111,6 +112,7 @@ def test_the_sentence_gives_turn_image_shift_and_their_errors() -> None:
 TURNS, SHIFTS, SCALES = st.floats(-np.pi, np.pi), st.floats(-1.5e-3, 1.5e-3), st.floats(0.98, 1.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(TURNS, st.booleans(), st.tuples(SHIFTS, SHIFTS), SCALES, st.integers(0, 10**6), st.booleans())
 def test_any_mounting_with_any_numbering(
@@ -130,6 +132,7 @@ def test_any_mounting_with_any_numbering(
     assert apart.max() < 1e-4, result.pose
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     TURNS,

@@ -36,6 +36,7 @@ def test_without_statsmodels_it_says_what_to_install(monkeypatch: pytest.MonkeyP
     assert refused.value.error_code == ErrorCode.NOT_SUPPORTED
 
 
+@pytest.mark.slow
 def test_finds_the_variables_that_matter_and_agrees_with_statsmodels(sm: Any) -> None:
     x = candidates(1)
     # Scales as apart as signals (1) and coefficients (1e-6 m).

@@ -81,6 +81,7 @@ def test_an_actuator_that_never_moved_is_no_candidate() -> None:
     assert 0.0 <= lower <= mean <= upper
 
 
+@pytest.mark.slow
 def test_commands_to_come_lie_in_their_intervals() -> None:
     maps, fit = calibrated()
     predictor = fit_predictor(maps, fit)

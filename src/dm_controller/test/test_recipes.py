@@ -161,6 +161,7 @@ def random_shape(rng: np.random.Generator, size: float) -> FocusTarget:
     return FocusTarget(float(rng.uniform(-0.05, 0.05)), 0.0, tuple(size * rng.standard_normal(len(TERMS))))
 
 
+@pytest.mark.slow
 def test_the_bound_holds_on_laws_that_really_err() -> None:
     """Random sets of recipes, of spheres and of shapes with added terms; models that promise too much; any law."""
     rng = np.random.default_rng(5)

@@ -308,6 +308,7 @@ def test_a_degauss_longer_than_the_watchdog_is_finished(unit: Edac40TcpUnit) -> 
         assert degauss(writer, 0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
 
 
+@pytest.mark.slow
 def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=4.0) as (writer, told):
         degauss(writer, 0.05, 1, shape(-0.9)).wait(5)
@@ -331,6 +332,7 @@ def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
     assert [state.link_up for state, _edge in told].count(False) >= 1
 
 
+@pytest.mark.slow
 def test_a_unit_that_restarts_while_idle_gets_the_shape_again(unit: Edac40TcpUnit) -> None:
     with running_writer(unit) as (writer, _told):
         assert writer.command(shape(-0.92)).wait(5) is Outcome.REACHED
@@ -398,6 +400,7 @@ def ramp_to_safe_shape(unit: Edac40TcpUnit, begins_at: float, since: int = 0) ->
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
 
 
+@pytest.mark.slow
 def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpUnit, tmp_path: Path) -> None:
     path = tmp_path / "unit.shape"
     LastShape(path, 37).note(
@@ -421,6 +424,7 @@ def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpU
         ramp_to_safe_shape(unit, 0.5, frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commanded", [False, True])
 def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path: Path, commanded: bool) -> None:
     """The way goes on, unless an accepted command took its place: then the shape stays where the link was lost."""
@@ -446,6 +450,7 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
             assert signals_of(unit.frames[-1:]) == pytest.approx(lost.applied[0], abs=CODE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("had_it_before", [True, False])
 def test_a_driver_that_waited_for_the_unit_begins_where_the_other_one_ended(
     unit: Edac40TcpUnit, tmp_path: Path, had_it_before: bool

@@ -40,7 +40,7 @@ def drive(law: Hysteresis, *signals: float) -> Array:
 @pytest.mark.parametrize("fraction", [0.05, 0.10, 0.15])
 def test_loop_opens_by_the_stated_fraction_of_a_total_stroke_of_two(law: str, fraction: float) -> None:
     hysteresis = Hysteresis(law, fraction, 1)
-    grid = np.linspace(-1, 1, 1501)
+    grid = np.linspace(-1, 1, 501)
     drive(hysteresis, *6 * (1.0, -1.0))
     rising, falling = drive(hysteresis, *grid), drive(hysteresis, *grid[::-1])[::-1]
     stroke = rising[-1] - rising[0]

@@ -34,6 +34,7 @@ def test_a_demo_empties_its_own_folder_and_no_other(tmp_path: Path, monkeypatch:
     assert (mine / "thesis.tex").read_text() == "years"
 
 
+@pytest.mark.slow
 def test_the_columns_of_the_picture_go_over_the_range_of_any_mirror(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
