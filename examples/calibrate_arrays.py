@@ -17,7 +17,7 @@ mirror = Mirror("my mirror", "1", run["x"], run["y"], working_radius=float(run["
 settings = IngestSettings(pitch=float(run["pitch"]), aperture_radius=mirror.working_radius)  # m per pixel, m
 
 calibration = calibrate(
-    run["sag"],  # (maps, height, width) m, NaN = no data
+    run["sag"],  # (maps, height, width) m, NaN = no data; a map may be all NaN
     run["commands"],  # (maps, actuators) normalised signals, from a degauss on
     run["times"],  # (maps,) s
     mirror=mirror,
@@ -32,4 +32,4 @@ rest = known.law.demagnetised(mirror.actuators, run["times"][0] - 1.0)
 effective, _ = follow(known.law, rest, run["commands"], run["times"])
 predicted = calibration.fit.zernike_offset + effective @ calibration.fit.influence_zernike.T
 left = (calibration.maps.coefficients - predicted)[:, 3:]  # without piston and tilt
-print(f"the run again: {np.sqrt(np.mean(left**2)) * 1e9:.2f} nm rms in the coefficients")
+print(f"the run again: {np.sqrt(np.nanmean(left**2)) * 1e9:.2f} nm rms in the coefficients")

@@ -27,7 +27,7 @@ from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
 from dm_tools.verbs import calibrate as verb
 from dm_tools.verbs.calibrate import REACHED, after_run, figures_of, metres, show_result
-from dm_tools.verbs.up import shared_config
+from dm_tools.verbs.up import add_camera, shared_config
 from example_hysteresis import plays
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"
@@ -95,6 +95,17 @@ def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:
     write_parameters(FOUND, target, source_of(target, None, "virtual-1"))
     assert "flip_x: false  # of mine" in (tmp_path / "my_bench.yaml.before").read_text()  # the first is not lost
     assert "flip_x: true  # of mine" in (tmp_path / "my_bench.yaml.before2").read_text()
+
+
+def test_a_bench_that_was_started_with_a_camera_keeps_it(tmp_path: Path) -> None:
+    target = tmp_path / "my_bench.yaml"
+    write_parameters(FOUND, target, source_of(target, None, "virtual-1", nodes=("autofocus",)))
+    written, started = load_config(target), load_config(shared_config("bench.yaml"))
+    add_camera(started)
+    assert written.pop("interferometer") != started.pop("interferometer")
+    assert written == started
+    own = source_of(target, None, "virtual-1", nodes=("autofocus",))  # which says itself what camera it has
+    assert own.text == target.read_text()
 
 
 def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from dm_calibration.procedure.run_journal import EVENTS, read_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from hysteretic_mirror import MIRROR, lagging_bench
 from map_hashes import map_hashes, record_hash
@@ -336,3 +336,24 @@ def test_a_run_killed_while_it_was_stored_measures_no_more(tmp_path: Path, monke
     action._run_kept(None)
     assert [run.storing for run in concluded] == [Storing("stored", 1)]
     assert len(again.outcome.records) == 5
+
+
+def test_a_run_that_is_cancelled_while_it_is_fitted_is_kept_and_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = opened(tmp_path, POKES)
+    outcome = procedure(run, POKES, lagging_bench()).run()
+    made = calibrate(outcome, mirror=MIRROR, provenance=Provenance("new", 1))
+    services = SimpleNamespace(rest=lambda _signals: "", settle_time=0.0, map_time=0.0, cancelled=lambda: True)
+    handle = SimpleNamespace(request=Calibrate.Goal(activate=True), publish_feedback=lambda _feedback: None)
+    manager = SimpleNamespace(known_mirror=lambda: MIRROR)  # which is asked to keep nothing
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, dict, handle)  # type: ignore[arg-type]
+    action._plan, action._mirror = POKES, MIRROR
+    monkeypatch.setattr(action, "_opened", lambda *_: run)
+    monkeypatch.setattr(action, "_procedure", lambda *_: SimpleNamespace(run=lambda: None))
+    monkeypatch.setattr(action, "_calibration", lambda _run: made)
+    action._run_kept(None)
+    assert action._result.error_code == ErrorCode.CANCELED and action._result.id == ""
+    assert f"{len(outcome.records)} maps are kept" in action._result.message
+    again = opened(tmp_path, POKES)
+    assert again.storing is None and len(again.outcome.records) == len(outcome.records)

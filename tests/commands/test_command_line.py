@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import entry_points
@@ -179,6 +180,7 @@ def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:
         (ValueError("[no] markup"), 1, "error: [no] markup"),
         (DeformableMirrorError(ErrorCode.BUSY, "held"), 1, "error: BUSY: held"),
         (KeyboardInterrupt(), 130, "error: interrupted"),
+        (KeyboardInterrupt("calibrate: 7 maps are kept"), 130, "error: interrupted; calibrate: 7 maps are kept"),
     ],
 )
 def test_exit_codes(
@@ -335,6 +337,27 @@ def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     said = started.communicate(timeout=300)[1]
     assert (started.returncode, "Traceback" in said) == (130, False), said
     assert said.endswith("error: interrupted\n")
+
+
+def test_a_command_that_is_interrupted_while_its_words_are_read_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read = cli.Group.parse_args
+
+    def interrupted(group: cli.Group, ctx: Any, words: list[str]) -> list[str]:
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+        return read(group, ctx, words)
+
+    monkeypatch.setattr(cli.Group, "parse_args", interrupted)
+    answered = signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with pytest.raises(SystemExit) as ended:
+            cli.run(["status"], "dm")
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, answered)
+    assert (ended.value.code, capsys.readouterr().err) == (130, "error: interrupted\n")
 
 
 def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:

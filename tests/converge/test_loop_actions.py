@@ -194,6 +194,16 @@ def test_what_the_host_refuses_does_not_start(rig: Rig) -> None:
     assert not rig.bench.measured
 
 
+def test_of_a_mirror_that_goes_on_without_an_actuator_no_recipes_are_built(rig: Rig) -> None:
+    """They would be withheld once they are stored."""
+    without = ["Poke check: none.", "Goes on without actuator 5 (stands at -1.00)."]
+    rig.host.focus.use(calibration(known_limitations=without), mirror_info())
+    _, refused = rig.run(recipes(0.0))
+    assert refused.error_code == ErrorCode.NOT_SUPPORTED, refused.message
+    assert "Goes on without actuator 5 (stands at -1.00): `./dm calibrate`" in refused.message
+    assert not (rig.bench.measured or rig.bench.degauss_steps or rig.stored)
+
+
 def test_what_is_reachable_is_what_requests_go_by(rig: Rig) -> None:
     assert rig.host.focus.active is not None
     edge = rig.host.focus.active.reachable_range(FocusTarget(0.0), 2e-8)[1]

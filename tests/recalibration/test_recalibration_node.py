@@ -22,11 +22,12 @@ from dm_msgs.srv import HoldMirror, LoadCalibration, StoreRecipes, UpdateCalibra
 
 from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import ErrorCode
+from dm_common.errors import NO_CALIBRATION, ErrorCode
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_tools.running_suite import promise_of
+from dm_tools.verbs.check import UNKNOWN
 from linear_mirror import LinearMirror
 from steady_mirror import NOISE, SteadyMirror, without_effect
 from support import NodeProcess, Observer, wait_until
@@ -189,6 +190,25 @@ def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path:
     assert "the map disagrees" in done.stdout
 
 
+def test_a_controller_that_was_restarted_alone_is_not_judged_by_what_another_node_knows(
+    begin: Callable[..., Suite], tmp_path: Path
+) -> None:
+    """Its wide bound was held against the error of a prediction that it cannot make."""
+    suite = begin(hysteresis=True)
+    suite.bench.on_degauss(0)
+    suite.shape()
+    node, figures = suite.observer.node, tmp_path / "figures.json"
+    able = node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
+    command = [sys.executable, "-m", "dm_tools", "check", "--json", str(figures)]
+    for lost in ("it moved before this node followed it", ""):
+        able.publish(Capabilities(error_bound=2.5e-7, message=f"all; {lost and UNKNOWN}{lost}; without actuator 6"))
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stdout + done.stderr
+        promised = 1e-9 * json.loads(figures.read_text())["check"]["promised_nm"]
+        assert promised == pytest.approx(promise_of(suite.calibration) if lost else 2.5e-7)
+        assert (f"does not know their history ({lost})" in done.stdout) == bool(lost), done.stdout
+
+
 def test_it_goes_on_without_an_actuator_that_died(suite: Suite) -> None:
     moved = suite.bench.plant.influence
     suite.bench.plant.influence = moved * (np.arange(suite.bench.mirror.actuators) != 6)
@@ -337,4 +357,4 @@ def test_without_a_calibration(start: Callable[..., NodeProcess], observer: Obse
     for fields in ({}, {"forget": True}):
         answer = observer.call(UpdateCalibration, "update_calibration", UpdateCalibration.Request(**fields))
         assert answer.error_code == ErrorCode.NOT_CALIBRATED
-        assert answer.message == "no calibration is in use: `./dm calibrate` or load_calibration"
+        assert answer.message == NO_CALIBRATION

@@ -22,7 +22,7 @@ from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
 from dm_calibration.procedure.resumable_run import OpenRun, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
@@ -258,6 +258,8 @@ class CalibrateAction:
             return
         if (found := calibration.hysteresis) is not None:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = found.name, found.held_out_max_zernike
+        if self._services.cancelled():  # while it was fitted; the same goal fits again what was measured
+            raise Cancelled("cancelled")
         self._report("store", calibration.id, len(self._plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
         result.file = str(self._manager.keep(calibration))

@@ -10,7 +10,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
 from dm_calibration.store.calibration_store import CalibrationStore, raw_hash
 from dm_common.atomic_write import StoreError
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, UnknownNameError
+from dm_common.errors import EXPECTED, NO_CALIBRATION, ErrorCode, Refusal, UnknownNameError
 from dm_common.figures import in_nanometres
 from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError
@@ -168,7 +168,7 @@ class CalibrationManager:
         """A stored calibration by id or file, or where `name` is empty that in use. Raises Refusal if there is none."""
         calibration = self.store.load(name) if name else self.in_use
         if calibration is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
         return calibration
 
     def _checked_in_use(self, calibration_id: str) -> Calibration:

@@ -98,7 +98,7 @@ def calibrate(
     Raises
     ------
     MapFileError, MapRejectedError, InsufficientDataError
-        A file or array is no good.
+        A file or array is no good. With ``hysteresis`` one with too few data is left out, and its command counts.
     MeasurementError
         A map cannot be compared with those before it.
     TooFewMapsError

@@ -108,6 +108,9 @@ class ClockError(CodedError, TimeoutError):
     error_code = ErrorCode.TIMEOUT
 
 
+#: That nothing can be predicted or kept true yet, and what to do.
+NO_CALIBRATION = "no calibration is in use: run `./dm calibrate` or load_calibration"
+
 #: Failures that are answered with a code and a message; anything else is a defect.
 EXPECTED = (CodedError, ValueError)
 

@@ -3,6 +3,9 @@
 import math
 from typing import Any
 
+#: Begins the part of what `capabilities` say that tells why the history of the actuators is not known.
+WIDER = "wider error bound: "
+
 
 def rounded(value: float) -> str:
     """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""

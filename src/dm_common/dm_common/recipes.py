@@ -16,6 +16,9 @@ import numpy as np
 from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
 
+#: Begins the known limitation of a calibration in use that goes on without some actuators; recipes are of all of them.
+GOES_ON_WITHOUT = "Goes on without actuator"
+
 
 class RecipeError(ValueError):
     """A recipe outside its range, or made under another condition or for another mirror."""

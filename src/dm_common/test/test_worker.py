@@ -20,7 +20,7 @@ from rclpy.time import Time
 from std_msgs.msg import Int32
 
 from dm_common.errors import Refusal
-from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call
+from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call, run_goal
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, never_silent, sleep
 from dm_common.values import Fields, real
 from ros_fixtures import Observer
@@ -330,3 +330,28 @@ def test_sleep_lasts_as_long_when_the_clock_is_set_meanwhile(simulated: bool, st
 
     assert sleep(cast(Any, SimpleNamespace(now=now, ros_time_is_active=simulated)), 0.3)
     assert 0.3 <= time.monotonic() - began < 3.0
+
+
+@pytest.mark.parametrize(
+    ("code", "said"), [(ErrorCode.CANCELED, "run: 7 maps"), (ErrorCode.OK, "run: done already: 7 maps")]
+)
+def test_who_interrupts_a_goal_is_told_what_became_of_it(code: int, said: str) -> None:
+    result = Degauss.Result(error_code=code, message="7 maps")
+    ended = SimpleNamespace(done=lambda: True, result=lambda: SimpleNamespace(result=result))
+    runs = SimpleNamespace(done=lambda: False)
+    futures, cancelled = [ended, runs], list[bool]()  # the last is asked first
+    goal = SimpleNamespace(get_result_async=lambda: futures.pop(), cancel_goal_async=lambda: cancelled.append(True))
+    accepted = SimpleNamespace(done=lambda: True, result=lambda: goal)
+    client = SimpleNamespace(
+        _action_name="run", server_is_ready=lambda: True, send_goal_async=lambda *_arguments: accepted
+    )
+    asked = iter((False, False))
+
+    def stop() -> bool:
+        if (answer := next(asked, None)) is None:
+            raise KeyboardInterrupt
+        return answer
+
+    with pytest.raises(KeyboardInterrupt) as interrupted:
+        run_goal(cast(Any, client), None, 5.0, stop=stop)
+    assert (str(interrupted.value), cancelled) == (said, [True])

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorState, FocusRequest
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_common.messages import applied_from, stamp_ns, unused_as_requested
 from dm_controller.conditioning import Conditioning
@@ -29,7 +29,7 @@ from dm_controller.focus_types import (
     SendCommand,
     StartDegauss,
 )
-from dm_controller.planning.active_calibration import NO_CALIBRATION, NO_TILT, ActiveCalibration, active_calibration
+from dm_controller.planning.active_calibration import NO_TILT, ActiveCalibration, active_calibration
 from dm_controller.planning.choice import Degauss, PlanningContext, choose_move, unreachable
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import REQUEST, FocusTarget

@@ -9,6 +9,7 @@ import numpy as np
 from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import ErrorCode
+from dm_common.figures import WIDER
 from dm_common.messages import doubles, estimate_message, time_message
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
@@ -174,7 +175,7 @@ def capabilities_message(
         message.error_code = ErrorCode.UNREACHABLE
     sentences = [empty or f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if unknown and active.planner.hysteresis is not None:
-        sentences.append(f"wider error bound: {unknown}")
+        sentences.append(f"{WIDER}{unknown}")
     dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == "dead"]
     if dead:
         sentences.append(f"without actuator{'s' if len(dead) > 1 else ''} {', '.join(dead)}")

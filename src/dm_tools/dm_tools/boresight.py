@@ -62,7 +62,8 @@ def run_boresight(
     with CameraFocusClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), BUSY_S):
             raise NotRunningError("no node of the suite is heard: start them (./dm up --camera, or your launch file)")
-        source = source_of(write, config, client.mirror_info.serial, namespace) if write is not None else None
+        serial, nodes = client.mirror_info.serial, ("autofocus",)  # else nothing of this works
+        source = source_of(write, config, serial, namespace, nodes) if write is not None else None
         reach = client.focus_range()
         span = reach.curvature_max - reach.curvature_min
 

@@ -83,15 +83,22 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+def _interrupted(error: BaseException) -> str:
+    """That Ctrl-C ended it, and what became of the goal that it cancelled, if any."""
+    return "; ".join(filter(None, ("interrupted", str(error))))
+
+
 class Group(TyperGroup):
     """The command, whose verbs end with the same status when they are interrupted, whatever the version of typer."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
         try:
+            # `./dm` keeps it back while modules are imported, and typer ends without a word while it reads the words.
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             return super().invoke(ctx)
         except (KeyboardInterrupt, typer.Abort) as error:  # the latter while something is asked
-            fail("interrupted")
+            fail(_interrupted(error))
             raise typer.Exit(INTERRUPTED) from error
 
 
@@ -167,15 +174,14 @@ def run(words: list[str], name: str) -> None:
     """Run the command, called by this name with these words, and end the process with its exit status."""
     _set_environment()
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # `./dm` keeps it back while modules are imported
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
         # As dm_msgs/ErrorCode calls it, for who looks it up or searches a log for it.
         code = f"{ErrorCode(error.error_code).name}: " if isinstance(error, CodedError) else ""
         fail(f"{code}{error}")
         sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)
-    except KeyboardInterrupt:
-        fail("interrupted")
+    except KeyboardInterrupt as error:
+        fail(_interrupted(error))
         sys.exit(INTERRUPTED)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
 from dm_common.errors import ErrorCode
-from dm_common.figures import in_nanometres
+from dm_common.figures import WIDER, in_nanometres
 from dm_tools.output import NotRunningError, as_wavelengths, errors
 
 if TYPE_CHECKING:
@@ -73,6 +73,12 @@ def promise_of(calibration: Any) -> float:
     if law is None:
         return float(calibration.held_out_max_zernike)
     return float(law.in_use * calibration.hysteresis.held_out_max_zernike)
+
+
+def unknown_history(capabilities: Any) -> str:
+    """Why the focus controller does not know what the actuators went through; "" = it does, or is not heard."""
+    said = capabilities.message.split("; ") if capabilities is not None else []
+    return next((text.removeprefix(WIDER) for text in said if text.startswith(WIDER)), "")
 
 
 def ago(seconds: float) -> str:

@@ -27,6 +27,9 @@ Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 #: Times lie within this, s: stamps are int64 numbers of ns.
 TIME_MAX_S = 9e9
 
+#: What an array spans is less, m: else it is of another unit.
+SAG_MAX = 1e-3
+
 #: Endings of the map files that are taken from a folder, in small letters; those of files may be in capitals.
 SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4d")
 
@@ -44,7 +47,8 @@ def outcome_of(
     Args and errors as of :func:`~dm_calibration.calibrator.calibrate`. Where neither `times` nor the files tell when
     all maps were taken, they count as one second apart, the last as just now.
     """
-    measured = _measured(maps, settings or IngestSettings(aperture_radius=mirror.working_radius))
+    settings = settings or IngestSettings(aperture_radius=mirror.working_radius)
+    measured, dropped = _measured(maps, settings, hysteresis)
     count = len(measured)
     signals = np.asarray(commands, dtype=np.float64)
     if signals.shape != (count, mirror.actuators):
@@ -74,6 +78,9 @@ def outcome_of(
     kinds = _kinds(np.abs(signals - rest) > 1e-9, hysteresis)
     for number, (one, row, kind) in enumerate(zip(measured, signals, kinds, strict=True)):
         label = f"{number + 1} {Path(one.file).name}" if one.file else f"map {number + 1}"
+        if number in dropped:
+            outcome.dropped.append(f"{label}: {dropped[number]}")
+            kind = StepKind.EXCITATION if kind == StepKind.REFERENCE else kind  # no figure is followed from it
         try:
             check_comparable(one, outcome, mirror.working_radius)
         except MeasurementError as error:
@@ -89,33 +96,57 @@ def outcome_of(
     return outcome
 
 
-def _measured(maps: Maps, settings: IngestSettings) -> list[Measurement]:
-    """One measurement a map; those from files with their time and digest."""
+def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Measurement], dict[int, str]]:
+    """One measurement a map; those from files with their time and digest.
+
+    Args:
+        gaps: a map with too few data leaves a command without a map, which belongs to the history of the actuators.
+
+    Returns:
+        Them, and by its index why a map leaves a gap.
+    """
     if isinstance(maps, str | Path):
         folder = Path(maps)
         maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not maps:
             raise ValueError(f"{folder}: holds no map file ({', '.join(SUFFIXES)})")
-    ingest, found = Ingest(), []
-    for number, one in enumerate(maps, 1):
-        if isinstance(one, Measurement):
-            found.append(one)
-        elif isinstance(one, str | Path):
-            surface, measured = ingest.read(Path(one), settings)
-            # Not when they were written: copies tell when they were copied.
-            stamp_ns = round(1e9 * (surface.time_stamp or 0.0))
-            found.append(replace(measured, stamp_ns=stamp_ns, sha256=surface.sha256))
-        else:
-            sag = np.asarray(one, dtype=np.float64)
-            if sag.ndim != 2:
-                raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
-            try:
-                found.append(ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1])
-            except (InsufficientDataError, MapRejectedError) as error:
-                raise type(error)(f"map {number}: {error}") from error
-    if not found:
-        raise ValueError("maps: there is none")
-    return found
+    ingest, found, dropped = Ingest(), list[Measurement | None](), dict[int, str]()
+    for number, one in enumerate(maps):
+        try:
+            found.append(one if isinstance(one, Measurement) else _of_map(one, number, ingest, settings))
+        except InsufficientDataError as error:
+            if not gaps:
+                raise
+            found.append(None)
+            dropped[number] = str(error).removeprefix(f"map {number + 1}: ")
+    last = next((one for one in found if one is not None), None)
+    if last is None:
+        raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
+    measured = []
+    for one in found:
+        last = without_map(last).record if one is None else one
+        measured.append(last)
+    return measured, dropped
+
+
+def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: IngestSettings) -> Measurement:
+    """The measurement that a file or an array (height, width), m, gives; `number`: its index."""
+    if isinstance(one, str | Path):
+        surface, measured = ingest.read(Path(one), settings)
+        # Not when they were written: copies tell when they were copied.
+        return replace(measured, stamp_ns=round(1e9 * (surface.time_stamp or 0.0)), sha256=surface.sha256)
+    sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # what is masked has no data
+    if sag.ndim != 2:
+        raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
+    seen = sag[np.isfinite(sag)]
+    if seen.size and np.ptp(seen) > SAG_MAX:
+        raise ValueError(
+            f"map {number + 1}: its sag spans {np.ptp(seen):.3g}: must be m, not um or nm, within {SAG_MAX:g}"
+        )
+    try:
+        return ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1]
+    except (InsufficientDataError, MapRejectedError) as error:
+        raise type(error)(f"map {number + 1}: {error}") from error
 
 
 def _kinds(away: NDArray[np.bool_], hysteresis: bool) -> list[StepKind]:

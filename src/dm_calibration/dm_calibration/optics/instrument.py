@@ -22,6 +22,8 @@ RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)
 TILT_MIN = 1e-7
 #: Coefficients of maps of one shape differ by no more than this once their retrace error is taken off, m.
 LEFT_MAX = 3e-8
+#: Nor by more than this share of what they differed by before, where that is not the noise of maps (m).
+LEFT_SHARE, LEFT_NOISE = 0.3, 3e-9
 #: Fewest maps, and fewest points of a grid, that leave something to judge the result by.
 MAPS_MIN, POINTS_MIN = 5, 8
 
@@ -82,10 +84,11 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
     design = np.column_stack((np.ones(len(maps)), tilt))
     solution = np.linalg.lstsq(design, terms, rcond=None)[0]
     before, left = (float(np.abs(terms - mean).max()) for mean in (terms.mean(axis=0), design @ solution))
-    if left > LEFT_MAX:
+    most = min(max(LEFT_SHARE * before, LEFT_NOISE), LEFT_MAX)
+    if left > most:
         raise ValueError(
-            f"coefficients differ by up to {left * 1e9:.0f} nm that do not go with the tilt: must be "
-            f"{LEFT_MAX * 1e9:.0f} nm or less; take maps of one shape, by smaller tilts, or average them"
+            f"coefficients differ by up to {left * 1e9:.1f} nm that do not go with the tilt: must be "
+            f"{most * 1e9:.1f} nm or less; take maps of one shape, by smaller tilts, or average them"
         )
     return solution[1:].ravel(), before, left
 

@@ -9,6 +9,7 @@ from scipy.special import ndtri
 
 from dm_common import Floats
 from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.recipes import GOES_ON_WITHOUT
 from dm_common.values import live_parameter, parameter, real, whole
 
 #: For one K, known beforehand of a mirror that no map has shown warmer, standard deviations: relative change of all
@@ -111,7 +112,7 @@ class Drift:
         """The actuators that do not move any more and where they stand, as a sentence; "" = all move."""
         indices = np.flatnonzero(np.isfinite(self.stuck))
         places = ", ".join(f"{index + 1} (stands at {self.stuck[index]:+.2f})" for index in indices)
-        return f"Goes on without actuator{'s' if indices.size > 1 else ''} {places}" if places else ""
+        return f"{GOES_ON_WITHOUT}{'s' if indices.size > 1 else ''} {places}" if places else ""
 
     @property
     def largest_gain(self) -> tuple[float, int]:

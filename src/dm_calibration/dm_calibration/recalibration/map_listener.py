@@ -22,7 +22,7 @@ from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsabl
 from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_calibration.requests import UPDATE_CALIBRATION
-from dm_common.errors import EXPECTED, ErrorCode, Refusal
+from dm_common.errors import EXPECTED, NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import qos
@@ -276,7 +276,7 @@ class MapListener:
 
     def _calibration(self) -> Calibration:
         if (kept := self._updates.in_use) is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: `./dm calibrate` or load_calibration")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
         return kept.calibration
 
     def health(self) -> tuple[bytes, list[str], dict[str, object]]:

@@ -66,9 +66,7 @@ def call(
         if time.monotonic() > deadline:
             raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
         time.sleep(0.02)
-    done = threading.Event()
-
-    answers: list[Any] = []
+    done, answers = threading.Event(), list[Any]()
 
     def answered(future: Any) -> None:
         answers.append(future.result())
@@ -132,11 +130,10 @@ def run_goal(
     identity: Any = None,
     send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
-    """Run a goal from a worker thread and return its result; one that is given up, be it by Ctrl-C, is cancelled first.
+    """Run a goal from a worker thread and return its result; one given up is cancelled first, and Ctrl-C says its end.
 
     Args:
-        client: of the action.
-        goal: to send.
+        client, goal: the action, and what to send.
         timeout_s: longest wait for the end.
         answer_s: longest wait for the server, and for an answer of it; None = `timeout_s`.
         on_feedback: called by the executor.
@@ -144,8 +141,6 @@ def run_goal(
         gone: whether the server is known to be gone; then nobody waits for it.
         identity: of the goal, a unique_identifier_msgs/UUID; None = any.
         send_by: called with what sends the goal, and returns what that does.
-
-    Never call this from an executor callback: it would wait for itself.
 
     Raises:
         ServiceCallError: no server, no answer or no end in time, or `stop()` before it began.
@@ -172,11 +167,17 @@ def run_goal(
             accepted.result().cancel_goal_async()
             wait(finished.done, timeout_s, "not finished")
         return finished.result().result
-    except BaseException:
+    except BaseException as error:
+        became = "cancelled, but whether it has ended is not known (./dm status)"
         with suppress(ServiceCallError):
             wait(accepted.done, answer_s, "no answer to the goal")
             accepted.result().cancel_goal_async()
-            wait(accepted.result().get_result_async().done, CANCEL_S, "not finished")
+            finished = accepted.result().get_result_async()
+            wait(finished.done, CANCEL_S, "not finished")
+            ended = finished.result().result
+            became = ended.message if ended.error_code else f"done already: {ended.message}"
+        if isinstance(error, KeyboardInterrupt):
+            error.args = (f"{name}: {became}",)
         raise
 
 

@@ -16,7 +16,7 @@ from rclpy.client import Client
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.creep_record import rested
 from dm_common.messages import recipe_book_message
-from dm_common.recipes import shape_text
+from dm_common.recipes import GOES_ON_WITHOUT, shape_text
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import WorkerGoal
@@ -73,6 +73,13 @@ class RecipeRun:
         options = self._options(goal)
         active = bench.active_calibration()
         planner, calibration = active.planner, active.calibration
+        without = next((text for text in calibration.known_limitations if text.startswith(GOES_ON_WITHOUT)), "")
+        if without:
+            raise Refusal(
+                ErrorCode.NOT_SUPPORTED,
+                f"calibration {calibration.id} withholds recipes: {without.rstrip('.')}: `./dm calibrate` measures the "
+                "mirror as it is, `./dm check --forget` takes the actuators back",
+            )
         targets = recipe_targets(goal.curvatures, goal.conic_constant, goal.zernike, planner, options.reachable)
         steps = self._values["recipes.degauss_steps"]
         active.recipes.check_condition(steps)

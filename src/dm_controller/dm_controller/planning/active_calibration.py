@@ -11,7 +11,7 @@ from dm_msgs.msg import Calibration, MirrorInfo
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
@@ -22,7 +22,6 @@ from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
-NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
 #: Where none was heard of; it goes for the first moments of the node.
 NOT_YET = "one that is in use already comes within seconds of this node's start"
 #: What to do where `hold_tilt` is true and cannot be.

@@ -75,7 +75,8 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
     """
     book, degauss = context.active.recipes, context.degauss
     if not book.recipes:
-        there = "the recipes are withheld: maps disagree" if book.degauss_steps else "this calibration holds no recipes"
+        withheld = "the recipes are withheld: maps disagree, or an actuator does not follow"
+        there = withheld if book.degauss_steps else "this calibration holds no recipes"
         raise Refusal(ErrorCode.NOT_SUPPORTED, f"mode conditioned: {there}; use auto or direct")
     if degauss.steps != book.degauss_steps:
         raise Refusal(

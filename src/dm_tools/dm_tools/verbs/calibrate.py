@@ -23,7 +23,7 @@ from dm_tools.output import (
     write_json,
 )
 from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
-from dm_tools.running_suite import REPORT_S, naming_holder, promise, promise_of, running_suite
+from dm_tools.running_suite import REPORT_S, naming_holder, nodes_of_suite, promise, promise_of, running_suite
 
 #: What tells the sentence of a result on what --until asked for.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
@@ -251,7 +251,7 @@ def calibrate(
     with running_suite(namespace) as client, naming_holder(client):
         source = None
         if write is not None and not dry_run:
-            source = source_of(write, config, client.mirror_info.serial, namespace)
+            source = source_of(write, config, client.mirror_info.serial, namespace, nodes_of_suite(client))
         if fresh:
             set_parameter(client, "calibration", "start_fresh", True)
         try:

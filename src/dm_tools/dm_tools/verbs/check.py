@@ -23,6 +23,7 @@ from dm_tools.running_suite import (
     promise_of,
     running_suite,
     settled_shape,
+    unknown_history,
     verdict,
 )
 
@@ -57,15 +58,21 @@ def check(
         # What the shape that stands was promised, and not what the calibration promises of any.
         client.wait(lambda: "focus_controller" in health, REPORT_S)
     shape, capabilities = settled_shape(health), client.messages.get("capabilities")
-    if shape is not None:
-        promised = shape.bound
-    elif capabilities is not None:
-        promised = capabilities.error_bound
-    else:  # without a focus controller, what one would promise
+    # The map is compared by the history that the node `calibration` knows, which may have run for longer.
+    lost = unknown_history(capabilities)
+    if lost or capabilities is None:  # what a focus controller would promise who knows as much
         promised = promise_of(calibration)
+    else:
+        promised = shape.bound if shape is not None else capabilities.error_bound
     if forget:
         console.print(response.message)
     else:
+        if lost:
+            console.print(
+                "[yellow]compared with where the actuators stand as the node `calibration` knows it, and not with the "
+                f"shape that was asked for: focus_controller does not know their history ({lost})[/]",
+                soft_wrap=True,
+            )
         console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
         console.print(two_fold(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
         if not response.accepted:
@@ -88,6 +95,9 @@ def check(
         raise typer.Exit(1)
     if without and not dry_run:
         next_step("ask for the shape again: the command that stands counts on all actuators; ./dm status has the range")
+        return
+    if lost and not forget:
+        next_step("./dm degauss: then focus_controller knows the history too")
         return
     next_step(
         "./dm report writes what the calibration holds"

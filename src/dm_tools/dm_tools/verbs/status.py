@@ -17,6 +17,7 @@ from dm_tools.running_suite import (
     promise,
     running_suite,
     settled_shape,
+    unknown_history,
     where,
 )
 
@@ -132,6 +133,6 @@ def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any,
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
     if calibration is None or not calibration.hysteresis.play_radius:
         return "./dm calibrate"
-    if capabilities is not None and "wider error bound" in capabilities.message:
+    if unknown_history(capabilities):
         return "./dm degauss: the actuators' history is not known, and the promise is wider for it"
     return "./dm check" if shape is not None else "./dm focus 0.02"

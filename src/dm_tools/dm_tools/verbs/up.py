@@ -30,6 +30,14 @@ PORTS_APART = 10
 DISTANCES = (6.0, 15.0, 100.0)
 REST_DISTANCE = 10.0
 RATE = 30.0
+CAMERA: Config = {
+    "virtual_bench": {
+        "camera.rate": RATE,
+        "camera.rest_distance": REST_DISTANCE,
+        "camera.distances": list(DISTANCES),
+    },
+    "autofocus": {"optics.rest_distance": REST_DISTANCE},
+}
 
 
 def shared_config(name: str) -> Path:
@@ -271,9 +279,5 @@ def move_trigger(config: Config, port: int) -> None:
 
 def add_camera(config: Config) -> None:
     """Put a camera behind the mirror of a virtual bench, and the node `autofocus`."""
-    config["virtual_bench"] |= {
-        "camera.rate": RATE,
-        "camera.rest_distance": REST_DISTANCE,
-        "camera.distances": list(DISTANCES),
-    }
-    config["autofocus"] = {"optics.rest_distance": REST_DISTANCE}
+    for node, values in copy.deepcopy(CAMERA).items():
+        config[node] = config.get(node, {}) | values
