@@ -9,16 +9,19 @@ Two slots are written in turn, each with a check sum, so that one is whole at an
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
 """
 
+import fcntl
 import logging
 import os
 import re
 import struct
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from dm_common.errors import Refusal
+from dm_driver.electronics.base import LinkError
 from dm_driver.output.volts import VoltScale
 from dm_driver.safety_limiter import SafetyLimiter, Shape
 
@@ -46,6 +49,26 @@ class LastShape:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+
+    def claim(self) -> None:
+        """Keep other drivers of this unit on this machine from it, until :meth:`release`, :meth:`close` or the end.
+
+        Raises:
+            LinkError: one has it. A unit on UDP would take the frames of both.
+        """
+        try:
+            if self._descriptor >= 0:
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise LinkError("another driver on this machine is connected to this unit; waiting for its end") from error
+        except OSError:  # a file system without locks
+            return
+
+    def release(self) -> None:
+        """Let others have the unit."""
+        with suppress(OSError):
+            if self._descriptor >= 0:
+                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def load(self) -> Shape | None:
         """(N,) codes, the newest whole record; None when there is none for this number of actuators, or when it was

@@ -79,9 +79,7 @@ class WriterThread:
         self._volts: NDArray[np.float64] | None = None
         self._written_ns = 0
         self._sequence = self._turns_published = 0
-        self._write_at = 0.0
-        self._check_at = 0.0
-        self._retry_at = 0.0
+        self._write_at = self._check_at = self._retry_at = 0.0
 
     def start(self) -> None:
         """Begin: open the electronics and keep the link. Nothing is written before `enable`."""
@@ -179,6 +177,7 @@ class WriterThread:
 
     def _connect(self) -> None:
         self._retry_at = time.monotonic() + RECONNECT_PERIOD_S
+        self._last.claim()
         self._electronics.open()
         if self._rewrite_due:
             self._confirm()  # first, for what is sent is recorded: a busy unit stands where its own driver puts it
@@ -272,6 +271,7 @@ class WriterThread:
 
     def _lose_link(self, reason: str) -> None:
         self._electronics.close()
+        self._last.release()
         with self._change:
             lost = self._link_up
             changed = lost or reason != self._fault

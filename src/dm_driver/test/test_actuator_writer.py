@@ -16,14 +16,14 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.degauss import degauss_move
-from dm_driver.electronics import Edac40Tcp
-from dm_driver.electronics.base import ElectronicsSettings
+from dm_driver.electronics import Edac40Tcp, Edac40Udp
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
 from dm_driver.last_shape import LastShape
 from dm_driver.moves import Kind, Move, Outcome, WriterState
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import OutputStage, wiring_table
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
-from drive_unit_servers import Edac40TcpUnit, signals_of
+from drive_unit_servers import Edac40TcpUnit, Edac40UdpUnit, signals_of
 from waiting import wait_until
 
 PAIRS = neighbour_pairs(*hexagonal_positions(37))
@@ -44,7 +44,10 @@ def limits(slew_rate: float) -> DriverLimits:
 
 @contextmanager
 def started_writer(
-    unit: Edac40TcpUnit, slew_rate: float = 1000.0, electronics: type[Edac40Tcp] = Edac40Tcp, **arguments: Any
+    unit: Edac40TcpUnit | Edac40UdpUnit,
+    slew_rate: float = 1000.0,
+    electronics: type[DriveElectronics] = Edac40Tcp,
+    **arguments: Any,
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
     """A writer that is not enabled yet, and what it told."""
     told: list[tuple[WriterState, bool]] = []
@@ -65,7 +68,7 @@ def started_writer(
 
 @contextmanager
 def running_writer(
-    unit: Edac40TcpUnit, *arguments: Any, **keywords: Any
+    unit: Edac40TcpUnit | Edac40UdpUnit, *arguments: Any, **keywords: Any
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
     with started_writer(unit, *arguments, **keywords) as (writer, told):
         assert writer.wait_for_link(5)
@@ -452,9 +455,13 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("had_it_before", [True, False])
+@pytest.mark.parametrize("locks", [True, False])
 def test_a_driver_that_waited_for_the_unit_begins_where_the_other_one_ended(
-    unit: Edac40TcpUnit, tmp_path: Path, had_it_before: bool
+    unit: Edac40TcpUnit, tmp_path: Path, had_it_before: bool, locks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Without locks, as between two machines, it is the unit that keeps the second one out."""
+    if not locks:
+        monkeypatch.setattr(LastShape, "claim", lambda self: None)
     path = tmp_path / "unit.shape"
     with ExitStack() as waiting:
 
@@ -481,6 +488,21 @@ def test_a_driver_that_waited_for_the_unit_begins_where_the_other_one_ended(
     seen = signals_of(unit.frames)
     assert np.abs(np.diff(seen, axis=0)).max() <= 0.1 + CODE
     assert seen[-1] == pytest.approx(-1.0, abs=CODE)
+
+
+def test_a_second_driver_of_a_unit_that_takes_frames_of_anybody_waits(tmp_path: Path) -> None:
+    path = tmp_path / "unit.shape"
+    with Edac40UdpUnit(discovery=False) as unit, ExitStack() as waiting:
+        assert isinstance(unit, Edac40UdpUnit)
+        with running_writer(unit, electronics=Edac40Udp, last=LastShape(path, 37)) as (first, _):
+            assert first.command(shape(0.8)).wait(5) is Outcome.REACHED
+            second, _ = waiting.enter_context(started_writer(unit, electronics=Edac40Udp, last=LastShape(path, 37)))
+            assert not second.enable(0.5) and not second.state().link_up
+            assert "another driver on this machine" in second.state().fault
+        assert second.wait_for_link(5)
+        wait_until(lambda: second.state().moving is None and second.state().applied is not None)
+        wait_until(lambda: len(unit.frames) > 1 and signals_of(unit.frames[-1:])[0, 0] < -1.0 + 2 * CODE)
+    assert np.abs(np.diff(signals_of(unit.frames), axis=0)).max() <= 0.1 + CODE
 
 
 def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40TcpUnit) -> None:
