@@ -27,7 +27,7 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import planned
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import ErrorCode
+from dm_common.errors import NO_CALIBRATION, ErrorCode
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, hexagon, make_mirror
@@ -300,7 +300,7 @@ def test_neighbours_that_are_not_there(start: Callable[..., NodeProcess], observ
     message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
     publisher.publish(message)
     health = observer.record(DiagnosticArray, "/diagnostics")
-    wait_until(lambda: any(m.status[0].message == "no calibration is in use" for m in health), 60)
+    wait_until(lambda: any(m.status[0].message == NO_CALIBRATION for m in health), 60)
     result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
     assert result.error_code == ErrorCode.DRIVER_UNAVAILABLE
     assert "the node pdm_driver is not running: start it" in result.message

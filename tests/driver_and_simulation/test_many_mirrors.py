@@ -67,10 +67,14 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, files: int, names: list[st
     ("node", "values", "words"),
     [
         ("calibration", {"calibration_folder": "/data"}, "mirror.serial, calibration_folder = A, /data"),
-        ("pdm_driver", {"electronics.address": "10.0.0.7"}, "electronics.address:electronics.port = 10.0.0.7:12340"),
-        ("pdm_driver", {"electronics.serial_port": "/dev/ttyUSB0"}, "electronics.serial_port = /dev/ttyUSB0"),
+        ("pdm_driver", {"electronics.address": "10.0.0.7"}, "electronics.address = 10.0.0.7:12340"),
+        (
+            "pdm_driver",
+            {"electronics.kind": "usb_dac40", "electronics.serial_port": "/dev/ttyUSB0"},
+            "electronics.serial_port = /dev/ttyUSB0",
+        ),
         ("interferometer", {"watch_folder": "/data/maps"}, "watch_folder = /data/maps"),
-        ("virtual_bench", {"trigger.port": 4321}, "virtual_bench trigger.port = 4321"),
+        ("virtual_bench", {"trigger.port": 4321}, "TCP port of virtual_bench = 4321"),
     ],
 )
 def test_mirrors_do_not_share_what_each_needs(

@@ -36,11 +36,10 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
 def _key(keys: Collection[str], node: str, namespace: str) -> str:
     """The section for what concerns one mirror: its own, also a new one where it names namespaces, else of all."""
     of_node = [key for key in keys if _node_name(key) == node and belongs(key, namespace)]
-    if own := [key for key in of_node if "*" not in key]:
-        return own[0]
     if namespace and any({*key.split("/")[:-1]} - {"", "*", EVERY} for key in keys):  # others may read what is of all
-        return f"/{namespace}/{node}"
-    return (of_node or [f"/**/{node}"])[-1]
+        own = f"/{namespace}/{node}"
+        return next((key for key in of_node if f"/{key.strip('/')}" == own), own)
+    return ([key for key in of_node if "*" not in key] or of_node[-1:] or [f"/**/{node}"])[0]
 
 
 def _with_value(text: str, key: str, name: str, value: Any) -> str:

@@ -15,13 +15,18 @@ class ConfigError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that comes twice, of which YAML keeps the last; ROS takes both of two sections."""
+    """Takes 7e-3 for a number, as ROS does, and refuses a key that comes twice, of which YAML keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value]
         if twice := [key for place, key in enumerate(keys) if key in keys[:place]]:
             raise yaml.constructor.ConstructorError(None, None, f"{twice[0]} comes twice", node.start_mark)
         return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), [*"-+.0123456789"]
+)
 
 
 def read_yaml(text: str) -> Any:
@@ -36,20 +41,34 @@ def read_yaml(text: str) -> Any:
 def belongs(key: str, namespace: str) -> bool:
     """Whether the section `key` of a parameter file is for nodes in `namespace` ("" = any), with wildcards as in ROS.
 
-    A name without a place, `pdm_driver`, is for any namespace here; to ROS it is for none.
+    `pdm_driver` and `/pdm_driver` are for any namespace here; to ROS they are for none but the root.
     """
-    place, _, name = key.strip("/").rpartition("/")
-    steps = [*filter(None, place.split("/")), *([EVERY] if name == EVERY else [])]
+    return not namespace or re.fullmatch(_pattern(key), f"/{namespace}") is not None
+
+
+def _pattern(key: str) -> str:
+    """Of the namespaces that a section is for, a regular expression."""
     wild = {EVERY: "(/[^/]+)*", "*": "/[^/]+"}
-    pattern = "".join(wild.get(step) or re.escape(f"/{step}") for step in steps)
-    return not (namespace and steps) or re.fullmatch(pattern, f"/{namespace}") is not None
+    return "".join(wild.get(step) or re.escape(f"/{step}") for step in _steps(key))
+
+
+def _steps(key: str) -> list[str]:
+    place, _, name = key.strip("/").rpartition("/")
+    return [*filter(None, place.split("/")), *([EVERY] if name == EVERY else [])] or [EVERY]
+
+
+def _covers(general: str, key: str) -> bool:
+    """Whether the section `general` is for all nodes that `key` is for."""
+    names = [each.rpartition("/")[2] for each in (general, key)]
+    inside = "".join(f"/{step}" for step in _steps(key))
+    return names[0] in (EVERY, names[1]) and re.fullmatch(_pattern(general), inside) is not None
 
 
 def values_in(sections: Mapping[str, Mapping[str, Any]], node: str, namespace: str) -> dict[str, Any]:
     """The values of a node in `namespace` ("" = any) of the sections of a file; of several the last counts, as to ROS.
 
     Raises:
-        ConfigError: a general section comes after the particular one that it overrules.
+        ConfigError: a section overrules one before it that is for some of its nodes only.
     """
     found: dict[str, Any] = {}
     given: dict[str, str] = {}  # the section that counts, by parameter
@@ -58,16 +77,11 @@ def values_in(sections: Mapping[str, Mapping[str, Any]], node: str, namespace: s
             continue
         for name, value in values.items():
             before = given.get(name, key)
-            if name in found and found[name] != value and _particular(key) < _particular(before):
+            if found.get(name, value) != value and _covers(key, before) and not _covers(before, key):
                 text = f"{value!r} overrules {found[name]!r} of {before}, for the last counts: put {key} before it"
                 raise ConfigError(f"{key}: {name}: {text}")
             found[name], given[name] = value, key
     return found
-
-
-def _particular(key: str) -> int:
-    """How few nodes a section is for: 0 = all, 1 = those of a name, 2 = one."""
-    return 2 if "*" not in key else int(key.rpartition("/")[2] != EVERY)
 
 
 def flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -64,20 +64,15 @@ def load_config(path: Path, namespace: str = "") -> Config:
 
 
 def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values as ROS reads them, where 1e5 among numbers is one; what it does not read is a ConfigError."""
-    found = dict(values)
+    """The values; what ROS does not read is a ConfigError."""
     for name, value in values.items():
         if value is None:  # written anew it would be `null`, a text to ROS
             raise ConfigError(f"{section}: {name}: must have a value, or be left out")
         kinds = {type(item) for item in value} if isinstance(value, list) else set[type]()
-        if kinds == {str, float}:
-            with contextlib.suppress(ValueError):
-                found[name] = [float(item) for item in value]
-                continue
         if len(kinds) > 1:
             text = 'must be of one type, as 0.0 and 2.5, or "--port" and "12"'
             raise ConfigError(f"{section}: {name} = {value}: {text}")
-    return found
+    return dict(values)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -31,7 +31,7 @@ from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListe
 from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import EXPECTED, ErrorCode, error_code
+from dm_common.errors import EXPECTED, NO_CALIBRATION, ErrorCode, error_code
 from dm_common.messages import mirror_from, recipe_book_from, recipe_book_message, time_message
 from dm_common.recipes import NO_RECIPES
 from dm_common.ros import qos
@@ -241,7 +241,7 @@ class CalibrationNode(ManagedNode):
         if mirror is None:
             return Health(WARN, "no mirror_info: is pdm_driver running?", values)
         if calibration is None:
-            return Health(WARN, "no calibration is in use", values)
+            return Health(WARN, NO_CALIBRATION, values)
         values["held_out_rms_nm"] = round(calibration.fit.held_out_rms * 1e9, 3)
         values["maps_used"] = int(calibration.fit.used.sum())
         level, warnings, figures = self._listener.health()

@@ -96,8 +96,23 @@ def test_a_folder_of_maps_whose_names_end_in_capitals(tmp_path: Path) -> None:
     assert [Path(record.file).name for record in outcome.records] == ["1.4D"]
     assert abs(outcome.records[0].stamp_ns - time.time_ns()) < 600e9  # a calibration of 1970 would be stale at once
     # Such a file does not tell its time, and a copy of it was written when it was copied.
-    with pytest.raises(ValueError, match="times: hysteresis and creep"):
+    with pytest.raises(ValueError, match="times: map 1 tells none"):
         outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS), True)
+
+
+def test_a_file_without_data_in_a_folder_wants_the_times(tmp_path: Path) -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)[:4]
+    for number, sag in enumerate(seen(plant, inside, commands)):
+        counts = np.where(inside & (number != 2), np.rint(sag / COUNT), NO_DATA).astype(np.int64)
+        (tmp_path / f"{number}.dat").write_bytes(dat_bytes(counts, pitch=PITCH, time=1_700_000_000 + 5 * number))
+    with pytest.raises(ValueError, match="times: map 3 tells none"):
+        outcome_of(tmp_path, commands, None, mirror, hysteresis=True)
+    times = 5.0 * np.arange(1, 5)
+    outcome = outcome_of(tmp_path, commands, times, mirror, hysteresis=True)
+    assert "none of the" in outcome.dropped[0] and outcome.dropped[0].startswith("map 3: ")
+    assert [record.stamp_ns / 1e9 for record in outcome.records][-4:] == list(times)
 
 
 def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
@@ -204,7 +219,7 @@ def test_measurements_and_what_is_refused() -> None:
         calibrate(sag, commands, [0.0, 1.0], mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match=r"times .* goes up to 1\.7e\+18: must be .* s"):
         calibrate(sag, commands, np.full(len(sag), 1.7e18), mirror=mirror, settings=settings)
-    with pytest.raises(ValueError, match="times: hysteresis and creep"):
+    with pytest.raises(ValueError, match="times: map 1 tells none"):
         calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
     with pytest.raises(ValueError, match="times: all are the same"):
         calibrate(sag, commands, np.zeros(len(sag)), mirror=mirror, settings=settings, hysteresis=True)

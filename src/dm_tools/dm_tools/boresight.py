@@ -62,8 +62,7 @@ def run_boresight(
     with CameraFocusClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), BUSY_S):
             raise NotRunningError("no node of the suite is heard: start them (./dm up --camera, or your launch file)")
-        serial, nodes = client.mirror_info.serial, ("autofocus",)  # else nothing of this works
-        source = source_of(write, config, serial, namespace, nodes) if write is not None else None
+        source = source_of(write, config, client.mirror_info.serial, namespace) if write is not None else None
         reach = client.focus_range()
         span = reach.curvature_max - reach.curvature_min
 
@@ -104,7 +103,7 @@ def run_boresight(
     write_json(json, {"boresight": figures | cost})
     parameters = parameter_text({"focus_controller": {"optical_axis": axis.round(6).tolist()}})
     if write is not None and source is not None:
-        write_parameters(parameters, write, source, namespace)
+        write_parameters(parameters, write, source, namespace, ("autofocus",))
     else:
         console.print("in use until the node ends; for its next start (--write FILE does it) put into its file:")
         console.print(parameters, markup=False, highlight=False)

@@ -3,7 +3,7 @@
 from collections.abc import Container
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from dm_common.errors import ErrorCode
 from dm_tools.output import console
@@ -44,45 +44,38 @@ def _answer(client: Any, node: str, ask: Any) -> Any:
     raise DeformableMirrorError(code, f"the node `{node}` does not answer: is it running (./dm up)?")
 
 
-class Source(NamedTuple):
-    """A parameter file, and what the nodes run with: its text, for the virtual bench with a camera with that."""
-
-    path: Path
-    text: str
-
-
-def source_of(
-    target: Path, config: Path | None, serial: str, namespace: str = "", nodes: Container[str] = ()
-) -> Source:
+def source_of(target: Path, config: Path | None, serial: str, namespace: str = "") -> Path:
     """The parameter file from which :func:`write_parameters` makes `target`.
 
     Args:
         config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
         serial: of the running mirror.
         namespace: of its nodes; "" = none.
-        nodes: that run: with autofocus the virtual bench that ships has a camera, which its file does not hold.
 
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
     """
-    from dm_bringup.config_edit import edited
     from dm_bringup.sections import ConfigError
     from dm_bringup.suite import load_config
-    from dm_tools.verbs.up import CAMERA, shared_config
+    from dm_tools.verbs.up import shared_config
 
-    shipped = shared_config("bench.yaml")
-    source = config or (target if target.exists() else shipped)
+    source = config or (target if target.exists() else shared_config("bench.yaml"))
     written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
         raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
-    text = source.read_text()
-    return Source(source, edited(text, CAMERA) if source == shipped and "autofocus" in nodes else text)
+    return source
 
 
-def write_parameters(parameters: str, target: Path, source: Source, namespace: str = "") -> None:
+def write_parameters(
+    parameters: str, target: Path, source: Path, namespace: str = "", nodes: Container[str] = ()
+) -> None:
     """Write the parameter file `target`: `source` with the `parameters` found of a mirror; comments are kept.
 
     What stood at `target` is kept beside it, and nothing that was kept so before is lost.
+
+    Args:
+        nodes: that run. With autofocus the virtual bench that ships was started with a camera, which is not in its
+            file: it is written too.
 
     Raises:
         ConfigError: `source` cannot be changed without losing its form.
@@ -90,14 +83,16 @@ def write_parameters(parameters: str, target: Path, source: Source, namespace: s
     """
     from dm_bringup.config_edit import edited, values_of
     from dm_common.atomic_write import write_whole
+    from dm_tools.verbs.up import CAMERA, shared_config
 
     if not parameters:
         console.print(f"no parameter has to be changed: {target} is not written")
         return
-    text = edited(source.text, values_of(parameters), namespace)
+    camera = CAMERA if source == shared_config("bench.yaml") and "autofocus" in nodes else {}
+    text = edited(edited(source.read_text(), camera), values_of(parameters), namespace)
     keep_before(target)
     write_whole(target.resolve(), text.encode())
-    console.print(f"{target} is written from {source.path}: start the nodes with it, then check again")
+    console.print(f"{target} is written from {source}: start the nodes with it, then check again")
 
 
 def keep_before(target: Path) -> None:

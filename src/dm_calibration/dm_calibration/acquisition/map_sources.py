@@ -12,7 +12,7 @@ from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
 from dm_calibration.hysteresis.response_fit import check_signals
 from dm_calibration.influence.maps import StepKind
-from dm_calibration.map_files import SurfaceMap
+from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.procedure.map_acquisition import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
@@ -67,7 +67,11 @@ def outcome_of(
         measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
     elif not all(one.stamp_ns for one in measured):
         if hysteresis:
-            raise ValueError("times: hysteresis and creep cannot be told apart without; give s, one for each map")
+            untold = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
+            raise ValueError(
+                f"times: map {untold} tells none, and without hysteresis and creep cannot be told apart: give s, one "
+                "for each map"
+            )
         last = time.time_ns()
         measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
     if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
@@ -114,7 +118,7 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     for number, one in enumerate(maps):
         try:
             found.append(one if isinstance(one, Measurement) else _of_map(one, number, ingest, settings))
-        except InsufficientDataError as error:
+        except (InsufficientDataError, NoValidPixelsError) as error:
             if not gaps:
                 raise
             found.append(None)
@@ -124,7 +128,7 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
         raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
     measured = []
     for one in found:
-        last = without_map(last).record if one is None else one
+        last = without_map(last, stamp_ns=0).record if one is None else one
         measured.append(last)
     return measured, dropped
 

@@ -86,9 +86,10 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
     before, left = (float(np.abs(terms - mean).max()) for mean in (terms.mean(axis=0), design @ solution))
     most = min(max(LEFT_SHARE * before, LEFT_NOISE), LEFT_MAX)
     if left > most:
+        tilts = "smaller" if most == LEFT_MAX else "larger"
         raise ValueError(
             f"coefficients differ by up to {left * 1e9:.1f} nm that do not go with the tilt: must be "
-            f"{most * 1e9:.1f} nm or less; take maps of one shape, by smaller tilts, or average them"
+            f"{most * 1e9:.1f} nm or less; take maps of one shape, by {tilts} tilts, or average them"
         )
     return solution[1:].ravel(), before, left
 

@@ -22,6 +22,7 @@ from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
+from dm_common.errors import NO_CALIBRATION
 from dm_common.measurement import Measurement
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
@@ -185,7 +186,7 @@ class RecalibrationManager:
 
     def _kept(self) -> InUse:
         if (kept := self.in_use) is None:
-            raise MapNotUsableError("no calibration is in use")
+            raise MapNotUsableError(NO_CALIBRATION)
         if kept.filter.options != (options := self._options()):  # parameters that are live
             kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, options))
         return kept

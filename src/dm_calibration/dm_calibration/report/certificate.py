@@ -102,13 +102,14 @@ def certificate(
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
-    middle = f"largest coefficient error of a sphere {length(predicted, calibration.wavelength)} in the middle"
+    within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
+    usual = f"largest coefficient error within {within} for half the spheres in the range"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach if np.isfinite(low) else "neither flat nor mid range is within reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"),
-        ("predicted", f"{middle}, up to {TOLERANCE * 1e9:.0f} nm at the ends" if np.isfinite(low) else middle),
+        ("predicted", f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends" if np.isfinite(low) else "not known"),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),

@@ -1,4 +1,4 @@
-"""Clients for threads that may wait: of services, of actions, and one that holds the mirror against others."""
+"""Clients for threads that may wait, as executor callbacks may not: of services, of actions, one to hold the mirror."""
 
 import math
 import threading
@@ -45,11 +45,8 @@ def call(
 ) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
-    Never call this from an executor callback: it would wait for itself.
-
     Args:
-        client: of the service.
-        request: to send.
+        client, request: the service, and what to send.
         timeout_s: longest wait for the server, and for its answer.
         cancelled: ends the wait.
         again_s: without an answer the request is sent again after so long, once; for one that may be carried out twice.
@@ -66,7 +63,8 @@ def call(
         if time.monotonic() > deadline:
             raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
         time.sleep(0.02)
-    done, answers = threading.Event(), list[Any]()
+    done = threading.Event()
+    answers: list[Any] = []
 
     def answered(future: Any) -> None:
         answers.append(future.result())
@@ -168,10 +166,11 @@ def run_goal(
             wait(finished.done, timeout_s, "not finished")
         return finished.result().result
     except BaseException as error:
-        became = "cancelled, but whether it has ended is not known (./dm status)"
+        became = "whether it has begun is not known (./dm status)"
         with suppress(ServiceCallError):
             wait(accepted.done, answer_s, "no answer to the goal")
             accepted.result().cancel_goal_async()
+            became = "asked to cancel; it ends with what is under way, such as a fit (./dm status)"
             finished = accepted.result().get_result_async()
             wait(finished.done, CANCEL_S, "not finished")
             ended = finished.result().result

@@ -22,6 +22,13 @@ UNSET = "CHANGE"
 DAY_S = 86400.0
 #: Parameters that every node has.
 COMMON = ("use_sim_time",)
+#: What the virtual bench listens to.
+BENCH_PORTS = {
+    "electronics.tcp_port": "TCP",
+    "electronics.udp_port": "UDP",
+    "electronics.discovery_port": "UDP",
+    "trigger.port": "TCP",
+}
 
 
 def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
@@ -142,13 +149,8 @@ def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
     """Ports that the bench wants and that others hold; None = all are free. A wrong value is passed over."""
     sound, taken = sound_values("virtual_bench", bench), []
     values = effective("virtual_bench", sound)
-    for name, kind in (
-        ("electronics.tcp_port", socket.SOCK_STREAM),
-        ("electronics.udp_port", socket.SOCK_DGRAM),
-        ("electronics.discovery_port", socket.SOCK_DGRAM),
-        ("trigger.port", socket.SOCK_STREAM),
-    ):
-        port = values[name]
+    for name, protocol in BENCH_PORTS.items():
+        port, kind = values[name], socket.SOCK_STREAM if protocol == "TCP" else socket.SOCK_DGRAM
         if port <= 0 or (name in bench and name not in sound):
             continue
         with socket.socket(socket.AF_INET, kind) as probe:

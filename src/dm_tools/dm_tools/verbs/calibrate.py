@@ -251,7 +251,7 @@ def calibrate(
     with running_suite(namespace) as client, naming_holder(client):
         source = None
         if write is not None and not dry_run:
-            source = source_of(write, config, client.mirror_info.serial, namespace, nodes_of_suite(client))
+            source = source_of(write, config, client.mirror_info.serial, namespace)
         if fresh:
             set_parameter(client, "calibration", "start_fresh", True)
         try:
@@ -259,11 +259,12 @@ def calibrate(
                 console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
+            nodes = nodes_of_suite(client) if source is not None else ()  # now: at first not all are heard
         except BaseException as error:
             if (response := getattr(error, "response", None)) is not None:
                 show_result(response)
                 if write is not None and source is not None and response.parameters:
-                    write_parameters(response.parameters, write, source, namespace)
+                    write_parameters(response.parameters, write, source, namespace, nodes_of_suite(client))
             if fresh:  # refused or interrupted before it began, it would hold for somebody else's goal
                 with suppress(DeformableMirrorError):
                     set_parameter(client, "calibration", "start_fresh", False)
@@ -277,7 +278,7 @@ def calibrate(
         if until:
             console.print(next((part for part in result.message.split("; ") if REACHED.search(part)), ""))
     if write is not None and source is not None:
-        write_parameters(result.parameters, write, source, namespace)
+        write_parameters(result.parameters, write, source, namespace, nodes)
     write_json(json, {"calibration": figures_of(result)})
     if dry_run:
         next_step("the same without --dry-run measures")

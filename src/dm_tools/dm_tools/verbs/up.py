@@ -231,7 +231,8 @@ def check_apart(mirrors: Mapping[str, Config]) -> None:
 
 def _own(config: Config) -> Iterator[tuple[str, Any]]:
     """What no other mirror may have, with the names of the parameters."""
-    from dm_tools.doctor.bench import effective, sound_values
+    from dm_driver.electronics import BACK_ENDS
+    from dm_tools.doctor.bench import BENCH_PORTS, effective, sound_values
 
     values = {node: effective(node, sound_values(node, given)) for node, given in config.items()}
     driver, bench = values["pdm_driver"], values.get("virtual_bench", {})
@@ -240,15 +241,14 @@ def _own(config: Config) -> Iterator[tuple[str, Any]]:
         "mirror.serial, calibration_folder",
         f"{config['pdm_driver'].get('mirror.serial')}, {Path(folder).expanduser()}",
     )
-    if port := driver["electronics.serial_port"]:
-        yield "electronics.serial_port", Path(port).expanduser()
-    elif driver["electronics.address"]:
-        yield "electronics.address:electronics.port", f"{driver['electronics.address']}:{driver['electronics.port']}"
+    kind = driver["electronics.kind"]
+    if kind in BACK_ENDS and (place := driver[name := f"electronics.{BACK_ENDS[kind].needs[0]}"]):
+        yield name, f"{place}:{driver['electronics.port']}" if kind.startswith("edac40") else Path(place).expanduser()
     if watched := values.get("interferometer", {}).get("watch_folder"):
         yield "watch_folder", Path(watched).expanduser()
-    for name in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port", "trigger.port"):
+    for name, protocol in BENCH_PORTS.items():
         if bench.get(name, 0) > 0:  # 0 = any that is free
-            yield f"virtual_bench {name}", bench[name]
+            yield f"{protocol} port of virtual_bench", bench[name]
 
 
 def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
