@@ -23,6 +23,7 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
@@ -148,6 +149,7 @@ class FilmedScene:
         state.conic_constant = request.conic_constant
         state.applied = abs(request.curvature) <= self.refuse_beyond
         state.history_known = self.history_known
+        state.curvature_min, state.curvature_max = -self.refuse_beyond, self.refuse_beyond
         state.predicted_max_zernike_upper = 500e-9  # after a night, most of it creep of hours
         state.header.stamp = self.node.get_clock().now().to_msg()
         if not state.applied:
@@ -483,6 +485,50 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
     wait_until(result.done, what="the end after cancel")
     assert result.result().status == GoalStatus.STATUS_CANCELED
     assert result.result().result.curvature == pytest.approx(-0.03, abs=0.002)
+
+
+def test_tracking_is_not_ended_by_a_goal_that_cannot_be_nor_by_a_range_that_narrows(
+    scene: FilmedScene, observer: Observer
+) -> None:
+    _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    for goal in (Autofocus.Goal(curvature_max=0.2), Autofocus.Goal(region=[0.5, 0.0, 0.9, 1.0])):
+        assert observer.run_goal(Autofocus, "autofocus", goal).result.error_code == ErrorCode.OUT_OF_RANGE
+    scene.refuse_beyond = scene.states[-1].curvature - 1e-5
+    refused = len(scene.requests)
+
+    def follows() -> bool:
+        asked = scene.requests[refused:]
+        return len(asked) > 10 and all(request.curvature <= scene.refuse_beyond for request in asked[-5:])
+
+    wait_until(lambda: result.done() or follows(), 30, "trials inside the range that is left")
+    assert not result.done(), result.result().result.message
+    assert scene.states[-1].phase == AutofocusState.PHASE_TRACK
+    scene._publish_image = lambda *_image: None  # type: ignore[method-assign]
+    wait_until(result.done, 30, "the end without images")
+    assert result.result().result.error_code == ErrorCode.TIMEOUT
+    health = observer.record(DiagnosticArray, "/diagnostics", 10)
+
+    def warned() -> bool:
+        return any("no image on /image_raw within image_timeout" in item.status[0].message for item in health)
+
+    wait_until(warned, 20, "the camera's silence in the node's health")
+    scene.refuse_beyond = HIGH
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.TIMEOUT and found.message.endswith("none came; is the camera running?")
+
+
+def test_a_stack_of_images_of_two_encodings_is_refused(scene: FilmedScene, observer: Observer) -> None:
+    """It would be published as what only the last one is."""
+
+    def change(feedback: Any) -> None:
+        if feedback.feedback.step == 5:
+            scene.encoding = "8UC1"
+
+    _handle, result = observer.send_goal(FocusStack, "focus_stack", FocusStack.Goal(), change)
+    wait_until(result.done, 60, "the end")
+    assert result.result().result.error_code == ErrorCode.INVALID_ARGUMENT
+    assert result.result().result.message == "the images changed their encoding from mono8 to 8UC1"
 
 
 def test_tracking_goes_on_when_the_controller_is_back(scene: FilmedScene, observer: Observer) -> None:

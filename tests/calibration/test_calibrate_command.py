@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from dm_bringup.suite import load_config
 from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.procedure.forecast import GoodEnough
+from dm_client import DeformableMirrorError
+from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
@@ -78,6 +81,24 @@ def test_a_fresh_start_that_was_interrupted_is_not_left_to_others(monkeypatch: p
     monkeypatch.setattr(verb, "expected_run", interrupted)
     CliRunner().invoke(cli.app, ["calibrate", "--fresh"])
     assert held == [True, False]
+
+
+def test_a_poke_check_that_no_parameter_puts_right_says_what_becomes_of_the_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def failed(_client: Any, _goal: Any) -> Any:
+        response = Calibrate.Result(poke_findings=["actuator 12 shows no response above the noise"])
+        raise DeformableMirrorError(ErrorCode.POKE_CHECK_FAILED, "actuator 12 shows no response", response)
+
+    client = FakeClient(CalibrationMsg())
+    client.mirror_info = SimpleNamespace(serial="virtual-1")  # type: ignore[attr-defined]
+    monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(client))
+    monkeypatch.setattr(verb, "nodes_of_suite", lambda _client: ())
+    monkeypatch.setattr(verb, "run_calibration", failed)
+    target = tmp_path / "found.yaml"
+    said = CliRunner().invoke(cli.app, ["calibrate", "--plan", "poke-check", "--write", str(target)])
+    assert "found.yaml is not written" in said.output.replace("\n", "") and not target.exists()
+    assert said.exit_code == 1
 
 
 def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -21,7 +22,7 @@ from typing import Annotated, Any, Union, get_origin, get_type_hints
 import pytest
 import typer
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
-from dm_msgs.srv import SetFocus
+from dm_msgs.srv import SetFocus, UpdateCalibration
 from typer.testing import CliRunner
 
 from console_stand_in import EXECUTING, FakeNode, Goal
@@ -31,6 +32,7 @@ from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
+from dm_tools.verbs import check
 from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
@@ -268,6 +270,7 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
     assert "inside" in verdict(97e-9, 1.3e-9) and "outside" in verdict(1e-9, 1.3e-9)
     assert "promised 153 nm (95 % bound), measured 100 nm: " in verdict(153.2e-9, 99.7e-9)
     assert "1266 nm (95 % bound), " in verdict(1265.6e-9, 1e-9)
+    assert "measured 1.32 nm: [red]outside" in verdict(1.27e-9, 1.32e-9)
     assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     state = FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True)
     state.message = "right to 1.3 nm; most of that for creep"
@@ -279,11 +282,35 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
 
 
 def test_what_stands_is_read_from_the_controllers_health() -> None:
-    values = {"curvature": 0.02, "age": "40.0", "bound": 1.3e-9, "held": True}
+    values = {"curvature": 0.02, "age": "40.0", "predicted": 1e-10, "bound": 1.3e-9, "held": True}
     pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
-    assert settled_shape({"focus_controller": SimpleNamespace(values=pairs)}) == SettledShape(0.02, 40.0, 1.3e-9, True)
+    shape = SettledShape(0.02, 40.0, 1.3e-9, True, 1e-10)
+    assert settled_shape({"focus_controller": SimpleNamespace(values=pairs)}) == shape
     assert settled_shape({"focus_controller": SimpleNamespace(values=pairs[3:])}) is None
     assert settled_shape({}) is None
+
+
+@pytest.mark.parametrize(("measured", "code"), [(4e-9, 0), (10e-9, 1)])
+def test_a_map_is_held_against_what_is_promised_beyond_the_prediction(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, measured: float, code: int
+) -> None:
+    """At an end of the range, where 20 nm are predicted; what is measured is by how much the map differs from that."""
+    values = {"curvature": 0.06, "age": "4.0", "predicted": 20e-9, "bound": 25e-9, "held": True}
+    pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
+    calibration, answer = Calibration(id="c1"), UpdateCalibration.Response(accepted=True, max_zernike=measured)
+    client = SimpleNamespace(
+        update_calibration=lambda **_options: answer,
+        latest=lambda _name: calibration,
+        messages={"capabilities": Capabilities(error_bound=3e-9)},
+        wait=lambda _condition, _timeout_s: True,
+    )
+    monkeypatch.setattr(check, "running_suite", lambda _namespace: nullcontext(client))
+    monkeypatch.setattr(check, "nodes_of_suite", lambda _client: {"focus_controller": 1})
+    monkeypatch.setattr(check, "hear_health", lambda _client: {"focus_controller": SimpleNamespace(values=pairs)})
+    said = CliRunner().invoke(cli.app, ["check", "--json", str(tmp_path / "figures")])
+    assert said.exit_code == code, said.output
+    assert "largest coefficient beyond what is predicted: promised 5 nm (95 % bound" in said.output
+    assert json.loads((tmp_path / "figures").read_text())["check"]["promised_nm"] == pytest.approx(5.0)
 
 
 def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:

@@ -61,6 +61,11 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
     whole = forecast(plan, 0.5, None, mirror, until=1e-12)
     assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.26e-9, rel=0.02)
     assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.3 nm (")
+    assert (
+        Forecast(170.0, 2.04e-9)
+        .accuracy(2e-9, False)
+        .startswith(", not expected to reach 2 nm: moves then right to 2.04 nm (")
+    )
     short = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=100))
     assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.1e-9, rel=0.1)
 

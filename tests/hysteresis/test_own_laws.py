@@ -12,6 +12,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import Identification, identify
+from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run
 from dm_common import Floats
@@ -89,7 +90,7 @@ def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(se
     assert found.fit.candidate.own
     assert not says_alike(found) and not says_alike(common)
     assert found.fit.law.actuators == 7
-    assert slope_min(found.fit.law) > 0.1
+    assert slope_min(found.fit.law).min() > 0.1
     assert held_out_rms(common) > 2.0 * held_out_rms(found)
 
 
@@ -116,14 +117,36 @@ def test_own_laws_that_cannot_be_inverted_are_tried_again_from_the_next_common_o
     run, check = relay_run(0.2, 14, 120)
     begun = list[int]()
 
-    def slope(law: HysteresisModel, low: float, high: float) -> float:
+    def slope(law: HysteresisModel, low: float, high: float) -> Floats:
         begun.append(law.actuators)
-        return -1.0 if begun.count(7) == 1 and law.actuators else 1.0
+        return np.full(1, -1.0 if begun.count(7) == 1 and law.actuators else 1.0)
 
     monkeypatch.setattr(law_shape, "slope_min", slope)
     coarser = replace(COMMON[1], name="coarser", plays=19)
     found = identify(run, check, (COMMON[0], coarser, *LAWS[1:]))
     assert found.fit.candidate.own and not found.refused and begun.count(7) == 2
+
+
+def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_nothing() -> None:
+    run, check = relay_run(0.2, 14, 120)
+    preisach = next(law for law in CANDIDATES if law.name == "Preisach, each actuator its own")
+    start, scatter = identify(run, check, COMMON).fit.law, np.full(12, NOISE)
+    free, keep = OwnLaws(run, preisach, start, scatter, -np.inf), np.ones(120, dtype=bool)
+    as_found = free.fit(keep)
+    steep = slope_min(as_found.law, *run.reach)
+    order = np.argsort(steep)
+    least = float(steep[order[:2]].mean())  # between the flattest law and the next
+    held = OwnLaws(run, preisach, start, scatter, least).fit(keep)
+    assert (slope_min(held.law, *run.reach) >= least).all() and steep[order[0]] < least
+    others = order[1:]
+    np.testing.assert_array_equal(held.patterns[:, others], as_found.patterns[:, others])
+    share = held.patterns[1:, order[0]] / as_found.patterns[1:, order[0]]
+    assert 0.7 < share[0] < 1.0 and share == pytest.approx(share[0])
+    assert np.square(held.residual).sum() > np.square(as_found.residual).sum()
+    other = run.gains(run.follow(held.law), keep)[1] - held.residual  # creep is simpler in a law
+    assert np.square(other).sum() < 0.1 * np.square(held.residual).sum()
+    # One that had to lose much of it stays, to be refused.
+    assert slope_min(OwnLaws(run, preisach, start, scatter, 0.98).fit(keep).law, *run.reach).min() < 0.98
 
 
 def test_own_laws_that_creep_without_bound_are_refused() -> None:
@@ -138,11 +161,11 @@ def test_own_laws_that_cannot_be_inverted_are_drawn_nearer_to_each_other(monkeyp
     run, check = relay_run(0.2, 14, 120)
     tried: list[HysteresisModel] = []
 
-    def slope(law: HysteresisModel, low: float, high: float) -> float:
+    def slope(law: HysteresisModel, low: float, high: float) -> Floats:
         if law.play_weight.ndim < 3:
-            return 1.0
+            return np.ones(1)
         tried.append(law)
-        return -1.0 if len(tried) == 1 else 1.0
+        return np.full(1, -1.0 if len(tried) == 1 else 1.0)
 
     monkeypatch.setattr(law_shape, "slope_min", slope)
     preisach = tuple(law for law in CANDIDATES if law.name.startswith("Preisach") and not law.slopes)
@@ -156,8 +179,8 @@ def test_own_laws_that_cannot_be_inverted_are_drawn_nearer_to_each_other(monkeyp
 def test_own_laws_whose_fading_cannot_be_inverted_fade_as_the_common_law(monkeypatch: pytest.MonkeyPatch) -> None:
     run, check = relay_run(0.2, 14, 120)
 
-    def slope(law: HysteresisModel, low: float, high: float) -> float:
-        return -1.0 if law.duhem_slope.ndim == 3 else 1.0  # each actuator's
+    def slope(law: HysteresisModel, low: float, high: float) -> Floats:
+        return np.full(1, -1.0 if law.duhem_slope.ndim == 3 else 1.0)  # each actuator's
 
     monkeypatch.setattr(law_shape, "slope_min", slope)
     duhem = tuple(law for law in CANDIDATES if law.name.startswith("Preisach and Duhem"))

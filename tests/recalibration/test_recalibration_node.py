@@ -22,8 +22,7 @@ from dm_msgs.srv import HoldMirror, LoadCalibration, StoreRecipes, UpdateCalibra
 
 from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import NO_CALIBRATION, ErrorCode
-from dm_common.figures import WIDER
+from dm_common.errors import HISTORY_UNKNOWN, NO_CALIBRATION, ErrorCode
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
@@ -201,7 +200,9 @@ def test_a_controller_that_was_restarted_alone_is_not_judged_by_what_another_nod
     able = node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
     command = [sys.executable, "-m", "dm_tools", "check", "--json", str(figures)]
     for lost in ("it moved before this node followed it", ""):
-        able.publish(Capabilities(error_bound=2.5e-7, message=f"all; {lost and WIDER}{lost}; without actuator 6"))
+        able.publish(
+            Capabilities(error_bound=2.5e-7, message=f"all; {lost and HISTORY_UNKNOWN}{lost}; without actuator 6")
+        )
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert done.returncode == 0, done.stdout + done.stderr
         promised = 1e-9 * json.loads(figures.read_text())["check"]["promised_nm"]

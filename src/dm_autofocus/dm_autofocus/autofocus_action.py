@@ -2,7 +2,9 @@
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from dm_msgs.action import Autofocus
@@ -74,10 +76,7 @@ class AutofocusAction(ProbeAction):
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
-                try:
-                    search.refuse()
-                except ValueError as reason:
-                    raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
+                _draw_in(search.refuse, error)
                 continue
             if search.current.config.approach < approach and (doubt := self._doubt()):
                 search.sweep(doubt, approach)
@@ -86,7 +85,10 @@ class AutofocusAction(ProbeAction):
                 search.feed(None)
                 continue
             phase, sample = search.current.phase, self._probe.measure(region)
-            search.feed(sample.sharpness, sample.regions)
+            try:
+                search.feed(sample.sharpness, sample.regions)
+            except ValueError as error:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
             self._report(goal_handle, phase, sample, step.curvature, step=search.measured, steps=search.steps)
         if search.reason:
             self._log.info(f"the range was swept: {search.reason}")
@@ -154,7 +156,15 @@ class AutofocusAction(ProbeAction):
             try:
                 wanted = tracker.step.curvature
                 if wanted != position:
-                    self._probe.move(wanted)
+                    try:
+                        self._probe.move(wanted)
+                    except Refusal as error:
+                        answer = self._probe.answer
+                        if error.error_code != ErrorCode.UNREACHABLE or answer is None:
+                            raise
+                        _draw_in(partial(tracker.refuse, answer.curvature_min, answer.curvature_max), error)
+                        position = math.nan  # no image counts before the next move
+                        continue
                     position = wanted
                 sample = self._probe.measure(region)
                 tracker.feed(sample.sharpness, sample.regions, seconds(sample.image.header.stamp))
@@ -196,6 +206,14 @@ class AutofocusAction(ProbeAction):
         result.dioptre = self._optics().dioptre_for(peak.curvature)
         result.distance = distance_of(result.dioptre)
         result.sharpness = peak.sharpness
+
+
+def _draw_in(refuse: Callable[[], None], error: Refusal) -> None:
+    """Have the range end before what the mirror refused. Raises Refusal where hardly anything of it is left."""
+    try:
+        refuse()
+    except ValueError as reason:
+        raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
 
 
 def _distance_text(dioptre: float, error: float) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import sys
+import time
 from typing import Any
 
 from dm_msgs.msg import AutofocusState, Capabilities, FocusRequest
@@ -45,6 +46,7 @@ class AutofocusNode(ManagedNode):
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer, qos_profile=qos.SERVICE)
         self._watched: Any = None
+        self._last_seen: tuple[Any, float] = None, 0.0  # by `health`: the newest image, and the steady time [s]
         self._image_problem = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._watch, clock=steady, autostart=False)
@@ -143,6 +145,12 @@ class AutofocusNode(ManagedNode):
             ready_capabilities(self._probe)
             if self._probe.newest is None:
                 raise Refusal(ErrorCode.TIMEOUT, f"no image on {self._probe.topic} yet")
+            (before, since), limit = self._last_seen, self._values["image_timeout"]
+            if self._probe.newest is not before:
+                self._last_seen = self._probe.newest, time.monotonic()
+            elif time.monotonic() - since > limit:
+                text = f"no image on {self._probe.topic} within image_timeout = {limit:g} s: is the camera running?"
+                raise Refusal(ErrorCode.TIMEOUT, text)
             if self._image_problem:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
         except Refusal as error:

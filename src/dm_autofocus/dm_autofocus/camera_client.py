@@ -12,7 +12,7 @@ from dm_msgs.srv import GetFocusRange, SetFocusDistance
 from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 
-from dm_autofocus.boresight import STEP, Boresight, BoresightError, find_boresight
+from dm_autofocus.boresight import STEP, Boresight, find_boresight
 from dm_autofocus.focus_probe import IMAGES, raw_image
 from dm_autofocus.images import grey, pixels_of
 from dm_autofocus.sharpness import check_region, cut
@@ -79,8 +79,7 @@ class CameraFocusClient(DeformableMirrorClient):
             timeout_s: longest time the search may take.
             claim: where somebody holds the mirror.
         """
-        goal = filled(Autofocus.Goal, region=region, **claim)
-        goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
+        goal = filled(Autofocus.Goal, region=region, **_ends(curvature_range), **claim)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
 
     def track(
@@ -93,6 +92,8 @@ class CameraFocusClient(DeformableMirrorClient):
         **claim: Unpack[Claim],
     ) -> None:
         """Search the sharpest focus in a region as `autofocus`, and stay on it for so many seconds."""
+        if not seconds >= 0:
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"seconds = {seconds}: must be 0 or more")
         goal = filled(Autofocus.Goal, region=region, track=True, **claim)
         ends = math.inf
 
@@ -130,8 +131,7 @@ class CameraFocusClient(DeformableMirrorClient):
             The result; an image that is sharp everywhere, (H, W, channels) in the camera's encoding; distances [m],
             (H, W): NaN = not known, inf = infinity or beyond the far end of the range, -inf = nearer than its near end.
         """
-        goal = filled(FocusStack.Goal, images=images, **claim)
-        goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
+        goal = filled(FocusStack.Goal, images=images, **_ends(curvature_range), **claim)
         topics = ("focus_stack/image", "focus_stack/depth")
         for topic in topics:
             self.hear(topic, Image, qos.LATCHED)
@@ -152,22 +152,28 @@ class CameraFocusClient(DeformableMirrorClient):
 
         Args:
             region: left, top, width, height as shares 0..1 of the image: an object that stands still.
-            pairs: images on either side of the focus, in turns.
+            pairs: images on either side of the focus, in turns; 2 at least.
             image_topic: of the camera, as `autofocus` takes it; with /compressed behind it too.
             stamp_lead: by how much an exposure begins before its image's stamp [s], as `autofocus` has it.
             claim: where somebody holds the mirror.
 
         Raises:
-            DeformableMirrorError: a search or a move did not succeed, images do not come, or do not follow tilt.
+            DeformableMirrorError: an argument cannot be, a search or a move did not succeed, images do not come, cannot
+                be used or do not follow tilt.
         """
-        part = check_region(region)
+        try:
+            part = check_region(region)
+            if pairs < 2:
+                raise ValueError(f"pairs = {pairs}: must be 2 or more")
+        except (TypeError, ValueError) as error:
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, str(error)) from error
+        topics = {image_topic: Image, f"{image_topic}/compressed": CompressedImage}
+        for topic, kind in topics.items():
+            self.hear(topic, kind, IMAGES)
         focus = self.autofocus(part, **claim).curvature
         reach = self.focus_range()
         step = STEP * reach.curvature_tolerance
         focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
-        topics = {image_topic: Image, f"{image_topic}/compressed": CompressedImage}
-        for topic, kind in topics.items():
-            self.hear(topic, kind, IMAGES)
 
         def see(curvature: float, tilt: NDArray[np.float64]) -> NDArray:
             zernike = np.zeros(len(TERMS))
@@ -187,7 +193,16 @@ class CameraFocusClient(DeformableMirrorClient):
 
         try:
             return find_boresight(see, focus, step, pairs)
-        except BoresightError as error:
+        except ValueError as error:  # of the images too
             raise DeformableMirrorError(ErrorCode.NOT_CONVERGED, str(error)) from error
         finally:  # it was tilted on purpose
             self.focus(focus, **claim)
+
+
+def _ends(curvature_range: tuple[float, float]) -> dict[str, float]:
+    try:
+        low, high = curvature_range
+    except (TypeError, ValueError) as error:
+        text = f"curvature_range = {curvature_range!r}: must be two curvatures, from and to"
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
+    return {"curvature_min": low, "curvature_max": high}

@@ -97,6 +97,7 @@ class FocusProbe:
         self._degauss_s = 0.0  # of a degauss that the latest move waits for
         self._measuring, self._apart = False, 0.0  # and the stamps of the latest two images, by so much [s]
         self._fresh: Image | CompressedImage | None = None
+        self._now = lambda: seconds(node.get_clock().now().to_msg())
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._hold = MirrorHolder(node, node.get_name())
         self._node, self.topic = node, ""
@@ -126,7 +127,7 @@ class FocusProbe:
         with self._changed:
             before, self.newest = self.newest, message
             self._apart = seconds(message.header.stamp) - seconds(before.header.stamp) if before is not None else 0.0
-            if not (self._measuring and self._gate.open_for(seconds(message.header.stamp))):
+            if not (self._measuring and self._gate.open_for(seconds(message.header.stamp), self._now())):
                 self.dropped += 1
                 return
             self.dropped += self._fresh is not None
@@ -192,8 +193,7 @@ class FocusProbe:
                 return True
 
         self._hold.wait_for(free, asked, str(self.busy()), self._values["move_timeout"])
-        self._other_request = None
-        self.counted = self.dropped = 0
+        self._other_request, self.counted, self.dropped = None, 0, 0
         self._check = check
         try:
             with self._hold.held(asked, f"action {action}; cancel it to end it", 0.0, self._values["move_timeout"]):
@@ -241,18 +241,18 @@ class FocusProbe:
         Raises:
             Refusal: no such image came in time, it cannot be used, or the user is to stop.
         """
-        samples: list[SharpnessSample] = []
-        limit = self._values["image_timeout"]
+        samples, limit = list[SharpnessSample](), self._values["image_timeout"]
         with self._changed:
             self._fresh, self._measuring = None, True
         try:
             while len(samples) < self._values["images_per_step"]:
+                before = self.newest
                 self._wait(lambda: self._fresh is not None, limit, self._check)
                 with self._changed:
                     message, self._fresh = self._fresh, None
                 if message is None:
-                    newest = None if self.newest is None else seconds(self.newest.header.stamp)
-                    reason = self._gate.reason(newest, self._apart, limit)
+                    newest = None if self.newest is None or self.newest is before else seconds(self.newest.header.stamp)
+                    reason = self._gate.reason(newest, self._apart, limit, self._now())
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
                     raise Refusal(ErrorCode.TIMEOUT, text)
                 samples.append(self.sharpness_of(message, region))

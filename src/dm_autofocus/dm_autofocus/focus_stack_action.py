@@ -84,8 +84,13 @@ class FocusStackAction(ProbeAction):
                     break
                 continue
             sample = self._probe.measure(WHOLE)
-            image = sample.image
+            before, image = image, sample.image
+            if stack.positions and (image.encoding, image.is_bigendian) != (before.encoding, before.is_bigendian):
+                text = f"the images changed their encoding from {before.encoding} to {image.encoding}"
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, text)
             try:
+                if len({region.shape for region in sample.regions}) > 1:
+                    raise ValueError("the images changed their size")
                 stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))
             except ValueError as error:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error

@@ -53,6 +53,8 @@ ENCODINGS: dict[str, _Layout] = {
 }
 #: Share of the pixels that have the largest value from which on its exposure is called wrong.
 CLIPPED = 0.2
+#: By how much a stamp may lie ahead of the time when the image is here [s]: a simulated clock ticks now and then only.
+STAMP_AHEAD = 0.5
 
 
 #: Encodings of the modes that Pillow decodes images to, "I" for 16 bits before its version 10.3; others are turned to
@@ -183,25 +185,29 @@ class SettledGate:
             earliest = self._sent_at if reached else self._stands_at
             self.settled_at = max(stamp, earliest) + self._settle_time
 
-    def open_for(self, stamp: float) -> bool:
-        """Whether an image with this stamp was exposed after the shape stood."""
-        return stamp - self._stamp_lead >= self.settled_at
+    def open_for(self, stamp: float, now: float = math.inf) -> bool:
+        """Whether an image with this stamp, that has come by now, was exposed after the shape stood."""
+        return stamp - self._stamp_lead >= self.settled_at and stamp <= now + STAMP_AHEAD
 
-    def reason(self, newest: float | None, apart: float, timeout_s: float) -> str:
+    def reason(self, newest: float | None, apart: float, timeout_s: float, now: float = math.inf) -> str:
         """Why no image has counted for a time.
 
         Args:
-            newest: stamp of the latest image; None = none came.
+            newest: stamp of the latest image that came meanwhile; None = none did.
             apart: from the one before it [s]; 0 = not known.
             timeout_s: how long one was waited for.
+            now: the time here.
         """
-        if newest is None:
-            return "none came at all; is the camera running?"
-        if newest == 0:
-            return "they carry no header.stamp, so nobody knows which focus they show; it must be above 0"
+        if newest is not None and newest > now + STAMP_AHEAD:
+            return f"the newest is stamped {newest - now:.3f} s ahead of the time here; do the clocks agree?"
         if 2 * apart > timeout_s:  # a period may pass until an exposure begins, and another until it has arrived
             return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
-        if not self.open_for(newest):
+        if newest is None:
+            return "none came; is the camera running?"
+        if newest == 0:
+            return "they carry no header.stamp, so nobody knows which focus they show; it must be above 0"
+        if not self.open_for(newest, now):
             early = self.settled_at + self._stamp_lead - newest
-            return f"the newest was exposed {early:.3f} s before the shape stood; do the clocks agree?"
+            why = "does the camera still run, do the clocks agree?"
+            return f"the newest was exposed {early:.3f} s before the shape stood; {why}"
         return "they stopped coming"

@@ -11,7 +11,8 @@ from rclpy.node import Node
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics
 from dm_autofocus.search.peak_search import Phase
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.optics.conic import range_text
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_common.values import Fields, real, text, without_figures
 
@@ -51,7 +52,7 @@ def range_of(goal: Any, capabilities: Capabilities) -> tuple[float, float]:
             raise Refusal(
                 ErrorCode.OUT_OF_RANGE,
                 f"curvature_min, curvature_max = {wanted[0]:+.4f}, {wanted[1]:+.4f} 1/m: must be a rising range "
-                f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
+                f"inside {range_text(low - margin, high + margin, '1/m')}, or both 0",
             )
         low, high = max(wanted[0], low), min(wanted[1], high)
     if not low < high:
@@ -89,7 +90,7 @@ class ProbeAction(ABC):
         self._optics = optics
         self._publish = publish
         self._server = WorkerActionServer(
-            node, self.action_type, self.name, self._run, exclusive="preempt", fields=self.fields
+            node, self.action_type, self.name, self._run, exclusive="preempt", fields=self.fields, admit=self._admit
         )
 
     @abstractmethod
@@ -99,6 +100,16 @@ class ProbeAction(ABC):
     @abstractmethod
     def _carry_out(self, goal_handle: WorkerGoal, plan: Any, result: Any) -> None:
         """Do it and fill the result, its message too. Raises Refusal."""
+
+    def _admit(self, goal: Any) -> None:
+        """Raise Refusal of a goal that cannot be, before it ends the one that runs."""
+        if self._probe.capabilities is None:
+            return  # they are waited for
+        try:
+            self._plan(goal)
+        except EXPECTED as error:
+            self._log.warning(f"goal refused: {error}")
+            raise Refusal(error_code(error), str(error)) from error
 
     def _run(self, goal_handle: WorkerGoal) -> tuple[str, Any]:
         started = time.monotonic()

@@ -116,15 +116,20 @@ METRICS: dict[str, Callable[[NDArray], float]] = {"tenengrad": tenengrad, "lapla
 
 def _rows(image: NDArray, pixel_budget: int) -> tuple[NDArray, NDArray, NDArray]:
     """Rows with their neighbours above and below, float32, thinned out to the budget; NaN counts as black."""
+    if image.dtype.kind == "f":
+        image = _finite(image)
     stride = max(1, math.ceil((image.shape[0] - 2) * image.shape[1] / pixel_budget))
-    above, here, below = (_finite(image[start : image.shape[0] - 2 + start : stride]) for start in (0, 1, 2))
-    return above, here, below
+    above, here, below = (image[start : image.shape[0] - 2 + start : stride] for start in (0, 1, 2))
+    return above.astype(np.float32), here.astype(np.float32), below.astype(np.float32)
 
 
 def _finite(image: NDArray) -> NDArray[np.float32]:
-    """As float32, what is not a finite number as black."""
+    """As float32, what is not a finite number as black; by a power of two below 1, lest squares overflow."""
     values = image.astype(np.float32)
-    return np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0) if image.dtype.kind == "f" else values
+    if image.dtype.kind != "f":
+        return values
+    np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.ldexp(values, -np.frexp(np.abs(values).max())[1])
 
 
 def _sobel(above: NDArray, here: NDArray, below: NDArray) -> tuple[NDArray, NDArray]:

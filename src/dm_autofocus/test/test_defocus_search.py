@@ -12,7 +12,7 @@ from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
 from dm_autofocus.search import defocus_search
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import DepthFromDefocus
-from dm_autofocus.search.focus_search import FocusSearch
+from dm_autofocus.search.focus_search import MOST_CHANGES, FocusSearch
 from dm_autofocus.search.peak_search import Phase, SearchConfig
 from dm_autofocus.sharpness import tenengrad
 
@@ -249,3 +249,26 @@ def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: Def
     assert visited.count(LOW) >= 3
     # In the units of the images: tracking compares the next ones with it.
     assert search.current.peak.sharpness == pytest.approx(tenengrad(camera.expose(0.01)), rel=0.1)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("changes", [[4], [3, 9], [5, 6, 14, 15]])
+def test_images_of_two_sizes_are_not_compared(model: DefocusModel, known: bool, changes: list[int]) -> None:
+    """Of another size they may be four times as sharp. The camera itself may change it, or its driver."""
+    config = replace(CONFIG, approach=0.0)
+    search, camera = FocusSearch(config, model if known else "no lens", 0.0), DefocusedCamera(clouds(), 0.01)
+
+    def feed_all() -> None:
+        for number in range(1000):
+            image, half = camera.expose(search.current.step.curvature), sum(number >= change for change in changes) % 2
+            search.feed((1 + 9 * half) * tenengrad(image), (image[::2] if half else image,))
+            if search.current.done:
+                break
+
+    if len(changes) > MOST_CHANGES:
+        with pytest.raises(ValueError, match="again and again"):
+            feed_all()
+        return
+    feed_all()
+    assert search.reason == "the images changed their size"
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.01, abs=DEPTH)

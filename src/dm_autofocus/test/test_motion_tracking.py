@@ -54,6 +54,25 @@ def test_it_ends_near_the_end_of_the_range(model: DefocusModel) -> None:
     assert HIGH - tracker.centre < BEFORE * 0.03 * PERIOD + DEPTH and LOW <= tracker.step.curvature <= HIGH
 
 
+@pytest.mark.parametrize(("direction", "end"), [(1, 0.013), (-1, 0.007)])
+def test_it_stays_where_the_mirror_reaches_no_farther(model: DefocusModel, direction: int, end: float) -> None:
+    """Be it less than half of the range that there was."""
+    reached = sorted([end, end - direction * 0.04])
+    camera = DefocusedCamera(clouds(3), 0.01)
+    tracker, refused = tracker_at(0.01, model, tenengrad(camera.expose(0.01))), 0
+    for number in range(30):
+        camera.place += direction * min(0.005 * PERIOD, direction * (end - camera.place) + DEPTH)
+        while direction * (tracker.step.curvature - end) > 0:
+            tracker.refuse(*reached)
+            refused += 1
+        image = camera.expose(tracker.step.curvature)
+        tracker.feed(tenengrad(image), (image,), 100.0 + number * PERIOD)
+    assert refused and not tracker.lost and abs(tracker.step.curvature - end) < DEPTH
+    with pytest.raises(ValueError, match=r"range = .*: too little of it is left"):
+        for _refusal in range(1000):
+            tracker.refuse(math.nan, math.nan)
+
+
 @pytest.mark.parametrize("cover", [0.1, 4.0])
 def test_the_focus_waits_while_somebody_walks_past(model: DefocusModel, cover: float) -> None:
     """Duller or sharper than the object: for half a second nothing of theirs is believed."""

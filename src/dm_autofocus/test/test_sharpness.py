@@ -88,6 +88,15 @@ def test_missing_values_do_not_spoil_the_figure() -> None:
     assert np.isfinite(tenengrad(image))
 
 
+@pytest.mark.parametrize("scale", [2.0**-100, 2.0**100])
+def test_numbers_of_any_size_have_a_sharpness(scale: float) -> None:
+    """Their squares are beyond what float32 can hold."""
+    image = texture().astype(np.float32)
+    for figure in METRICS.values():
+        assert figure(image * np.float32(scale)) == pytest.approx(figure(image))
+    assert local_tenengrad(image * np.float32(scale), 8) == pytest.approx(local_tenengrad(image, 8))
+
+
 def message(pixels: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> SimpleNamespace:
     height, width = pixels.shape[:2]
     rows = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")).reshape(height, -1).view(np.uint8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -46,6 +47,24 @@ def test_it_tracks_from_the_end_of_the_search_on(lost_after: float | None, monke
     else:
         with pytest.raises(DeformableMirrorError, match="no more"):
             client.track(5.0, on_feedback=heard.append)
+
+
+@pytest.mark.parametrize(
+    ("ask", "text"),
+    [
+        (lambda camera: camera.autofocus(curvature_range=(0.01,)), "curvature_range = .0.01,.: must be two curvatures"),
+        (lambda camera: camera.focus_stack(curvature_range=None), "curvature_range = None: must be two curvatures"),
+        (lambda camera: camera.autofocus(curvature_range=("low", 0.02)), "curvature_min = 'low': must be double"),
+        (lambda camera: camera.track(math.nan), "seconds = nan: must be 0 or more"),
+        (lambda camera: camera.boresight((0.5, 0.5, 1.0, 1.0)), "region = .*: left, top, width, height"),
+        (lambda camera: camera.boresight(None), "NoneType"),
+        (lambda camera: camera.boresight((0.5, 0.5, 0.5, 0.5), pairs=1), "pairs = 1: must be 2 or more"),
+        (lambda camera: camera.focus_power("much"), "power = 'much': must be double"),
+    ],
+)
+def test_an_argument_that_cannot_be_is_refused_by_name(ask: Callable[[Any], object], text: str) -> None:
+    with pytest.raises(DeformableMirrorError, match=text):
+        ask(CameraFocusClient.__new__(CameraFocusClient))
 
 
 @pytest.mark.parametrize(("stamp", "counts"), [(10.3, False), (10.4, True)])

@@ -85,7 +85,7 @@ def test_the_law_of_a_single_actuator_comes_back_from_the_message() -> None:
     all_maps = np.ones(60, dtype=bool)
     run = Run(signals, np.arange(60.0), Responses(seen, 1, all_maps))
     common = HysteresisModel(np.zeros(1), np.ones((1, 1)), np.array([1.4]), WEIGHT, 0.0, CREEP_TIMES)
-    law = OwnLaws(run, CANDIDATES[-1], common, np.full(1, 1e-9)).fit(all_maps).law
+    law = OwnLaws(run, CANDIDATES[-1], common, np.full(1, 1e-9), -np.inf).fit(all_maps).law
     back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
     assert back is not None
     np.testing.assert_allclose(run.follow(back), run.follow(law))

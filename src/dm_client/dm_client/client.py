@@ -82,7 +82,7 @@ class Claim(TypedDict, total=False):
 
 
 class DeformableMirrorClient(Connection):
-    """Talk to one mirror's nodes. Use as a context manager.
+    """Talk to one mirror's nodes, from any thread but that which calls `on_feedback`. Use as a context manager.
 
     Args:
         namespace: of the mirror, "" for none; that of the process it runs in does not count.
@@ -159,7 +159,7 @@ class DeformableMirrorClient(Connection):
 
     def focus_power(self, power: float, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Set the optical power [dioptre] = 2 x surface curvature."""
-        return self.focus(power / 2.0, dry_run=dry_run, **claim)
+        return self.focus(filled(FocusState, power=power).power / 2.0, dry_run=dry_run, **claim)
 
     def flatten(self, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Make the surface as flat as the mirror can."""

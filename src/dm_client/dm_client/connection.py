@@ -1,5 +1,6 @@
 """One node in a thread of its own, for code that calls and waits: the latest messages, services, actions."""
 
+import atexit
 import itertools
 import os
 import time
@@ -8,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import rclpy
-from rclpy.exceptions import InvalidNamespaceException
+from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
@@ -34,6 +35,8 @@ RESTING = (
     ErrorCode.DRIVER_UNAVAILABLE,
     ErrorCode.ELECTRONICS_UNREACHABLE,
 )
+#: What a ROS domain may be.
+DOMAINS = range(233)
 #: Two connections of one process need two names.
 _NUMBERS = itertools.count(1)
 
@@ -98,6 +101,9 @@ class Connection:
         timeout_s: float = 10.0,
     ) -> None:
         place, own = full_namespace(namespace), f"{name}_{os.getpid()}_{next(_NUMBERS)}"
+        if domain is not None and domain not in DOMAINS:  # Fast DDS would end the process
+            text = f"domain = {domain!r}: must be {DOMAINS[0]} to {DOMAINS[-1]}"
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, text)
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         # A launched process may be told another name and namespace, which are those of its own node.
@@ -105,6 +111,7 @@ class Connection:
         self.node = Node(own, namespace=place, context=self._context, cli_args=rules)
         self.messages: dict[str, Any] = {}
         self._heard: set[str] = set()
+        self._closed = False
         self._on_message, self._timeout_s = on_message, timeout_s
         self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
@@ -119,14 +126,20 @@ class Connection:
     def start(self) -> None:
         """Begin to hear; what is added to the node before misses nothing."""
         self._background = BackgroundExecutor(self.node)
+        atexit.register(self.close)  # the interpreter aborts where the thread still runs
 
     def close(self) -> None:
-        """Leave the ROS graph; the mirror keeps its shape."""
+        """Leave the ROS graph; the mirror keeps its shape. Who still waits for an answer in another thread is told."""
+        self._closed = True
+        atexit.unregister(self.close)
         self._background.destroy_node()
         self._context.try_shutdown()
 
     def hear(self, topic: str, message_type: Any, profile: Any) -> bool:
-        """Keep the latest message of a topic from now on; False = it is kept already."""
+        """Keep the latest message of a topic from now on; False = it is kept already.
+
+        Raises DeformableMirrorError where it cannot be the name of one.
+        """
         if topic in self._heard:
             return False
         self._heard.add(topic)
@@ -135,7 +148,12 @@ class Connection:
             self.messages[topic] = message
             self._on_message(topic, message)
 
-        self.node.create_subscription(message_type, topic, take, profile)
+        try:
+            self.node.create_subscription(message_type, topic, take, profile)
+        except InvalidTopicNameException as error:
+            self._heard.discard(topic)
+            text = f"topic = {topic!r}: {str(error).splitlines()[0]}"
+            raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
         return True
 
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
@@ -212,14 +230,28 @@ class Connection:
     @contextmanager
     def _answered(self, name: str) -> Iterator[Callable[[], str]]:
         """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
+        closed = "the client has been closed"
+        if self._closed:
+            raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {closed}")
+        if self._background.is_here:
+            text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
+            raise DeformableMirrorError(ErrorCode.BUSY, text)
         server = self._servers.get(name)  # None of a client that its user has added
         if server is not None:
             server.wait_for_return()
-        gone = server.since_now() if server is not None else lambda: ""
+        lost = server.since_now() if server is not None else lambda: ""
+
+        def gone() -> str:
+            return closed if self._closed else lost()
+
         try:
             yield gone
-        except ServiceCallError as error:
+        except Exception as error:
+            if self._closed:  # whatever rclpy says of what is destroyed
+                raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {closed}") from error
+            if not isinstance(error, ServiceCallError):
+                raise
             code, text = error.error_code, str(error)
-            if server is not None and (lost := gone()):
-                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost}"
+            if server is not None and (reason := lost()):
+                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {reason}"
             raise DeformableMirrorError(code, text) from error

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dm_msgs.action import BuildRecipes, Degauss
+from dm_msgs.msg import MirrorInfo
 from dm_msgs.srv import IngestFile, Measure, SetFocus, SetSignals, UpdateCalibration
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError
@@ -57,6 +58,14 @@ def test_the_interferometer_keeps_the_time_of_a_measurement(monkeypatch: pytest.
     assert (name, request.timeout) == ("measure", 7.0) and waits > 7.0, "its answer says why"
 
 
+@pytest.mark.parametrize("domain", [233, -1, "1"])
+def test_a_domain_that_cannot_be_is_refused(domain: Any) -> None:
+    """Fast DDS ends the whole process."""
+    with pytest.raises(DeformableMirrorError, match=f"domain = {domain!r}: must be 0 to 232") as refused:
+        DeformableMirrorClient(domain=domain)
+    assert refused.value.error_code == ErrorCode.OUT_OF_RANGE
+
+
 @pytest.mark.parametrize("namespace", ["1bad", "my mirror", "a//b"])
 def test_a_namespace_that_cannot_be_is_refused(namespace: str) -> None:
     with pytest.raises(DeformableMirrorError, match="namespace = ") as refused:
@@ -76,3 +85,11 @@ def test_a_client_in_a_launched_process_talks_to_the_mirror_that_it_is_for(
         assert client.node.get_name().startswith("dm_client_")
         assert client.node.resolve_service_name("set_focus") == f"{place.rstrip('/')}/set_focus"
         assert client.node.resolve_topic_name("image_raw") == "/camera/image"
+
+
+def test_a_topic_that_cannot_be_is_refused(domain: int) -> None:
+    with DeformableMirrorClient(domain=domain) as client:
+        for _again in range(2):
+            with pytest.raises(DeformableMirrorError, match="topic = 'a b': Invalid topic name") as refused:
+                client.hear("a b", MirrorInfo, 10)
+            assert refused.value.error_code == ErrorCode.INVALID_ARGUMENT

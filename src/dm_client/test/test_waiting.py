@@ -1,7 +1,11 @@
-"""What a client waits for before it takes the nodes for ready. Without processes."""
+"""What a client waits for, and what becomes of it when the client is closed. Without nodes."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +20,7 @@ from dm_common.errors import ErrorCode
 def client(driver: int, able: int | None) -> DeformableMirrorClient:
     """One that has heard this state of the driver and this code of the controller; None = there is no controller."""
     heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
+    heard._closed, heard._background = False, SimpleNamespace(is_here=False)  # type: ignore[assignment]
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
@@ -83,3 +88,44 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest
     with pytest.raises(ZeroDivisionError, match="step 1"):
         asked.run_action("converge", Converge.Goal(), fail, 1.0)
     assert cancelled == [False, True]
+
+
+def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: int) -> None:
+    waits = [
+        lambda mirror: mirror.focus(0.01),
+        lambda mirror: mirror.move_focus(0.01),
+    ]
+    with DeformableMirrorClient(domain=domain, timeout_s=60.0) as mirror:
+        told = list[str]()
+
+        def ask(way: Any) -> None:
+            with pytest.raises(DeformableMirrorError) as ended:
+                way(mirror)
+            told.append(str(ended.value))
+
+        threads = [threading.Thread(target=ask, args=(way,)) for way in waits]
+        for thread in threads:
+            thread.start()
+        time.sleep(0.3)
+    for thread in threads:
+        thread.join(5.0)
+    for way in waits:  # and who asks only now
+        ask(way)
+    assert sorted(told) == sorted(2 * [f"{name}: the client has been closed" for name in ("move_focus", "set_focus")])
+
+
+def test_what_asks_inside_a_callback_is_refused_at_once() -> None:
+    """Nobody would take the answer."""
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    asked._background = SimpleNamespace(is_here=True)  # type: ignore[assignment]
+    with pytest.raises(DeformableMirrorError, match=r"flatten: .* call it from another thread"):
+        asked.flatten()
+
+
+def test_a_program_that_closes_nothing_ends_in_order(domain: int) -> None:
+    """Though something comes at that moment; it would end with SIGABRT."""
+    program = f"""from dm_client import DeformableMirrorClient
+mirror = DeformableMirrorClient(domain={domain})
+mirror.node.create_timer(1e-3, int)"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -110,6 +110,8 @@ class ClockError(CodedError, TimeoutError):
 
 #: That nothing can be predicted or kept true yet, and what to do.
 NO_CALIBRATION = "no calibration is in use: run `./dm calibrate` or load_calibration"
+#: Begins the part of what `capabilities` say that tells why the history of the actuators is not known.
+HISTORY_UNKNOWN = "wider error bound: "
 
 #: Failures that are answered with a code and a message; anything else is a defect.
 EXPECTED = (CodedError, ValueError)

@@ -3,9 +3,6 @@
 import math
 from typing import Any
 
-#: Begins the part of what `capabilities` say that tells why the history of the actuators is not known.
-WIDER = "wider error bound: "
-
 
 def rounded(value: float) -> str:
     """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""
@@ -15,6 +12,16 @@ def rounded(value: float) -> str:
 def in_nanometres(length: float) -> str:
     """A length (m) with two significant digits, such as 1.3 nm."""
     return f"{rounded(length * 1e9)} nm"
+
+
+def told_from(length: float, other: float) -> str:
+    """A length (m) with as many digits as tell it from one that it is compared with, two at least, such as 2.04 nm."""
+    text, beside = in_nanometres(length), in_nanometres(other)
+    for digits in (3, 4, 5):
+        if text != beside:
+            return text
+        text, beside = (f"{value * 1e9:.{digits}g} nm" for value in (length, other))
+    return text if text != beside else in_nanometres(length)
 
 
 def in_wavelengths(length: float, wavelength: float) -> str:

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from dm_common.figures import in_nanometres, in_wavelengths, two_fold
+from dm_common.figures import in_nanometres, in_wavelengths, told_from, two_fold
+from dm_common.optics.conic import range_text
 
 
 @pytest.mark.parametrize(
@@ -22,6 +23,34 @@ from dm_common.figures import in_nanometres, in_wavelengths, two_fold
 )
 def test_a_length_in_nanometres_and_by_the_wavelength(length: float, nanometres: str, wavelengths: str) -> None:
     assert (in_nanometres(length), in_wavelengths(length, 632.8e-9)) == (nanometres, wavelengths)
+
+
+@pytest.mark.parametrize(
+    ("length", "other", "text"),
+    [
+        (3.11e-9, 2e-9, "3.1 nm"),
+        (2.04e-9, 2e-9, "2.04 nm"),
+        (153.2e-9, 153.4e-9, "153.2 nm"),
+        (2e-9, 2e-9, "2 nm"),
+        (2.04e-9, 0.0, "2 nm"),
+    ],
+)
+def test_a_length_is_told_from_the_one_beside_it(length: float, other: float, text: str) -> None:
+    assert told_from(length, other) == text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (-0.05128, 0.03776, "-0.0512 to +0.0377 1/m"),
+        (-0.05, 0.0377, "-0.0500 to +0.0377 1/m"),  # on the mark is inside
+        (-0.00004, 0.03776, "+0.0000 to +0.0377 1/m"),
+        (0.03772, 0.03776, "+0.0377 to +0.0378 1/m"),  # nothing lies between two marks
+        (float("nan"), float("nan"), "+nan to +nan 1/m"),
+    ],
+)
+def test_a_range_is_rounded_inwards(low: float, high: float, text: str) -> None:
+    assert range_text(low, high, "1/m") == text
 
 
 @pytest.mark.parametrize(

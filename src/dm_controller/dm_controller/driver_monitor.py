@@ -88,6 +88,15 @@ class DriverMonitor:
             return None
         return stood if same_signals(report.requested, stood.command.signals) else None
 
+    @property
+    def shape(self) -> Order | None:
+        """Whose shape the driver reports, be it before a correction that is on its way; None = nobody's."""
+        order, report = self.order, self.latest
+        if order is None or order.move is None or not order.kept or report is None:
+            return None
+        commands = [each for each in (order.command, order.earlier) if each is not None]
+        return order if any(same_signals(report.requested, each.signals) for each in commands) else None
+
     def lost(self, reason: str) -> None:
         """What became of a driver that is known to be dead, as a sentence; "" = it may live."""
         self.gone = reason

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusState, MirrorInfo
 
-from dm_common.errors import ErrorCode
-from dm_common.figures import WIDER
+from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
+from dm_common.optics.conic import range_text
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
-from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_types import Moment, Order
 from dm_controller.forecast import HysteresisShare
@@ -102,8 +101,8 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
     return "; ".join(filter(None, (nowhere(controller.active, values["reachable_tolerance"]), remark)))
 
 
-def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -> float:
-    """95 % bound of the largest coefficient error of the shape of `order`, which stands, m."""
+def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -> tuple[float, float]:
+    """Of the shape of `order`, which stands: largest coefficient error that is predicted, and its 95 % bound, m."""
     was, active, observer = order.active, controller.active, controller.observer
     assert was is not None  # else it had been refused
     plan, planner = move.plan, was.planner
@@ -118,13 +117,14 @@ def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -
     if drift and observer.state is not None and observer.law.same_as(was.planner.law):
         drift = planner.drift(observer.state, now.time, move.effective)
     # What was written again after a lost link is on another branch of the hysteresis than it was found for.
-    return largest + planner.error_bound(not observer.unknown or not move.known, spread) + drift
+    return largest, largest + planner.error_bound(not observer.unknown or not move.known, spread) + drift
 
 
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment, missing: str = "") -> Health:
     """The health of the node whose parameters are `values`, and what is `missing` beside it, as a sentence.
 
-    While the shape stands that was asked for: its curvature (1/m), for how long (s), the 95 % bound on its error (m).
+    While the shape stands that was asked for: its curvature (1/m), for how long (s), the largest coefficient error that
+    is predicted of it and the 95 % bound on that error (m).
     """
     figures: dict[str, object] = {
         "requests": controller.requests,
@@ -133,15 +133,15 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment, 
         "held": controller.hold.active,
         "corrections": controller.hold.corrections,
     }
-    order, report = controller.monitor.order, controller.monitor.latest
-    if order is not None and order.move is not None and order.kept and report is not None:
-        assert order.command is not None  # it is the last that went out
-        if same_signals(report.requested, order.command.signals):
-            figures |= {
-                "curvature": order.move.target.curvature,
-                "age": f"{now.time - order.began.time:.1f}",
-                "bound": _bound(controller, order, order.move, now),
-            }
+    order = controller.monitor.shape
+    if order is not None and order.move is not None:
+        predicted, bound = _bound(controller, order, order.move, now)
+        figures |= {
+            "curvature": order.move.target.curvature,
+            "age": f"{now.time - order.began.time:.1f}",
+            "predicted": predicted,
+            "bound": bound,
+        }
     text = "; ".join(filter(None, (trouble(controller, values, now), missing)))
     return Health(WARN if text else OK, text or "ready", figures)
 
@@ -173,9 +173,9 @@ def capabilities_message(
     low, high = active.reachable_range(FocusTarget(0.0), tolerance)
     if empty := nowhere(active, tolerance):
         message.error_code = ErrorCode.UNREACHABLE
-    sentences = [empty or f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
+    sentences = [empty or f"{range_text(low, high, '1/m')} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"]
     if unknown and active.planner.hysteresis is not None:
-        sentences.append(f"{WIDER}{unknown}")
+        sentences.append(f"{HISTORY_UNKNOWN}{unknown}")
     dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == "dead"]
     if dead:
         sentences.append(f"without actuator{'s' if len(dead) > 1 else ''} {', '.join(dead)}")

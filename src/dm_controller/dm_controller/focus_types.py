@@ -72,6 +72,7 @@ class Order:
         answered: what came of its command has been said.
         gap: largest distance from its shape seen, normalised.
         command: the last one for its shape; None = none went out.
+        earlier: the one before it that the driver has confirmed: it stands until the last one, on its way, arrives.
         creep_held: its shape is corrected for creep from its command on, until that is ended.
         checked: s, ROS time, when creep was looked at last.
         stood: whose shape stands on if the driver does not take the first command, until it has; None = nobody's.
@@ -89,6 +90,7 @@ class Order:
     answered: bool = False
     gap: float = 0.0
     command: SendCommand | None = None
+    earlier: SendCommand | None = None
     creep_held: bool = False
     checked: float = 0.0
     stood: Order | None = None
@@ -96,6 +98,7 @@ class Order:
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
         """Another command for its shape, on behalf of the same holder."""
+        self.earlier = self.command if self.command is not None and self.command.confirmed else self.earlier
         self.command = SendCommand(signals, now, expected_turns, self.request.holder)
         return self.command
 

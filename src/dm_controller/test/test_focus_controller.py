@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
@@ -286,6 +287,23 @@ def test_a_calibration_without_tilt_is_named_where_tilt_is_to_be_held(removed: b
     assert any("other: its maps do not show" in text for text in bench.log) == (removed and hold_tilt)
     assert bench.controller.active is not None
     assert (bench.controller.active.mirror.tilt is None) == (removed or not hold_tilt)
+
+
+@pytest.mark.parametrize("pattern", [r"(\S+) to (\S+) 1/m", r"\((\S+) to (\S+) dioptre"])
+@pytest.mark.parametrize("stroke", [0.81, 0.84, 0.87])
+def test_both_ends_of_the_range_that_is_told_may_be_asked_for(bench: Bench, stroke: float, pattern: str) -> None:
+    message = calibration("straight", HysteresisModel.linear())
+    for name in ("influence_zernike", "influence_sag"):
+        setattr(message, name, doubles(stroke * np.array(getattr(message, name))))
+    bench.do(bench.controller.use(message, MIRROR))
+    told = capabilities_message(bench.controller, MIRROR, VALUES, bench.now).message
+    beyond = bench.ask(1.0)
+    for text in (told, str(beyond.refusal)):
+        found = re.search(pattern, text)
+        assert found is not None
+        for end in found.groups():
+            order = bench.ask(float(end) / (2.0 if "dioptre" in pattern else 1.0))
+            assert order.refusal is None, end
 
 
 def test_it_goes_on_without_an_actuator_that_does_not_move_and_says_so(bench: Bench) -> None:
@@ -992,6 +1010,28 @@ def test_health_says_what_stands_as_long_as_it_does() -> None:
     assert float(str(told["age"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(told["bound"])) < 3e-6
     bench.degauss()
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values
+
+
+def test_health_says_what_stands_while_a_correction_is_on_its_way(bench: Bench) -> None:
+    bench.ask(0.02)
+    bench.wait(1.0)
+    order = bench.controller.monitor.order
+    assert order is not None and order.command is not None and order.command.confirmed
+    for _ in range(2):  # the driver has reported neither yet
+        order.send_on(order.command.signals + 1e-4, bench.now)
+        assert health(bench.controller, VALUES, bench.now).values["curvature"] == 0.02
+    bench.move(np.full(ACTUATORS, 0.1))  # somebody else
+    assert "curvature" not in health(bench.controller, VALUES, bench.now).values
+
+
+def test_health_tells_what_is_predicted_of_a_shape_apart_from_what_is_promised_beyond(bench: Bench) -> None:
+    bench.do(bench.controller.use(calibration("straight", HysteresisModel.linear()), MIRROR))
+    assert bench.controller.active is not None
+    order = bench.ask(bench.controller.active.reachable_range(FocusTarget(0.0), VALUES["reachable_tolerance"])[1])
+    bench.wait(1.0)
+    told, plan = health(bench.controller, VALUES, bench.now).values, move_of(order).plan
+    assert told["predicted"] == plan.max_zernike > 1e-8
+    assert float(str(told["bound"])) == pytest.approx(plan.max_zernike_upper, rel=1e-3)
 
 
 def test_the_bound_of_what_stands_follows_the_calibration(bench: Bench) -> None:

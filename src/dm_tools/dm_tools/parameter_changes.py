@@ -86,7 +86,7 @@ def write_parameters(
     from dm_tools.verbs.up import CAMERA, shared_config
 
     if not parameters:
-        console.print(f"no parameter has to be changed: {target} is not written")
+        console.print(f"no parameter to change: {target} is not written, {source} holds")
         return
     camera = CAMERA if source == shared_config("bench.yaml") and "autofocus" in nodes else {}
     text = edited(edited(source.read_text(), camera), values_of(parameters), namespace)

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
-from dm_common.errors import ErrorCode
-from dm_common.figures import WIDER, in_nanometres
+from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
+from dm_common.figures import in_nanometres, told_from
 from dm_tools.output import NotRunningError, as_wavelengths, errors
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def promise_of(calibration: Any) -> float:
 def unknown_history(capabilities: Any) -> str:
     """Why the focus controller does not know what the actuators went through; "" = it does, or is not heard."""
     said = capabilities.message.split("; ") if capabilities is not None else []
-    return next((text.removeprefix(WIDER) for text in said if text.startswith(WIDER)), "")
+    return next((text.removeprefix(HISTORY_UNKNOWN) for text in said if text.startswith(HISTORY_UNKNOWN)), "")
 
 
 def ago(seconds: float) -> str:
@@ -97,7 +97,7 @@ def kept(promised: float, measured: float) -> bool:
 def verdict(promised: float, measured: float) -> str:
     """Promised (0 = not known) and measured largest coefficient error (m), and whether the promise was kept."""
     judged = "[green]inside[/]" if kept(promised, measured) else "[red]outside[/]"
-    found = f"promised {promise(promised)}, measured {in_nanometres(measured)}"
+    found = f"promised {promise(promised)}, measured {told_from(measured, promised)}"
     return f"{found}: {judged}" if promised > 0.0 else found
 
 
@@ -168,12 +168,14 @@ class SettledShape(NamedTuple):
         seconds: since its command.
         bound: m, 95 % bound on its largest coefficient error.
         held: creep is fed forward.
+        predicted: m, of that error, what is predicted beforehand: the limits leave it, and maps agree with it.
     """
 
     curvature: float
     seconds: float
     bound: float
     held: bool
+    predicted: float = 0.0
 
 
 def settled_shape(health: dict[str, Any]) -> SettledShape | None:
@@ -183,6 +185,7 @@ def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     )
     if "curvature" not in values:
         return None
-    return SettledShape(
-        float(values["curvature"]), float(values["age"]), float(values["bound"]), values["held"] == "True"
+    curvature, age, bound, predicted = (
+        float(values.get(name, 0.0)) for name in ("curvature", "age", "bound", "predicted")
     )
+    return SettledShape(curvature, age, bound, values["held"] == "True", predicted)

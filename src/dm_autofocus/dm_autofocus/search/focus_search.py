@@ -10,6 +10,9 @@ from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import EXPECTED_IMAGES, DepthFromDefocus
 from dm_autofocus.search.peak_search import PeakSearch, SearchConfig
 
+#: How often a search begins anew as the images change their size.
+MOST_CHANGES = 3
+
 
 class FocusSearch:
     """A search from a few images where that is possible, and else, or when it gives up, a `PeakSearch`.
@@ -27,7 +30,8 @@ class FocusSearch:
 
     def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
         self.reason, self.unexplained = "", False
-        self._before = 0
+        self._before = self._changes = 0
+        self._shapes = set[tuple[int, ...]]() if isinstance(model, str) else {model.shape}  # of the images, (H, W) each
         self._model = model
         self._seen: list[tuple[float, NDArray, float]] = []  # place, powers and sharpness of each image
         self.current: DepthFromDefocus | PeakSearch
@@ -48,8 +52,14 @@ class FocusSearch:
         return max(self._before + self.current.config.steps if swept else EXPECTED_IMAGES, self.measured)
 
     def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
-        """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured."""
-        powers, seen = self._powers(images), sharpness
+        """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured.
+
+        Raises:
+            ValueError: the images change their size again and again: their sharpness cannot be compared.
+        """
+        powers, seen, shapes = self._powers(images), sharpness, {image.shape for image in images}
+        changed = bool(shapes and self._shapes) and shapes != self._shapes
+        self._shapes = shapes or self._shapes
         if sharpness is None:
             pass
         elif powers is None:
@@ -58,11 +68,15 @@ class FocusSearch:
             assert isinstance(self._model, DefocusModel)
             seen = self._model.sharpness(powers)
             self._seen.append((self.current.step.curvature, powers, sharpness))
-        if isinstance(self.current, PeakSearch):
+        if changed:
+            self._changes += 1
+            if self._changes > MOST_CHANGES:
+                raise ValueError("the images change their size again and again")
+            self.sweep("the images changed their size", self.current.config.approach)
+        elif isinstance(self.current, PeakSearch):
             self.current.feed(seen)
-        elif seen is None or powers is None:
-            self.sweep("the images changed their size", 0.0)
         else:
+            assert seen is not None and powers is not None, "it measures every step"
             self.current.feed(seen, powers)
             self._sweep_after_all()
         if self.current.done and self.current.peak is not None and self._seen:

@@ -89,6 +89,11 @@ class SearchConfig:
             sweeps += 1
         return self.coarse_points + max(sweeps, 1) * self.fine_points
 
+    def check_left(self) -> None:
+        """Raise ValueError where hardly anything of the range is left."""
+        if self.high - self.low < 2 * self.tolerance:
+            raise ValueError(f"range = {self.low:+.4f} to {self.high:+.4f} 1/m: too little of it is left")
+
 
 @dataclass(frozen=True)
 class Peak:
@@ -141,10 +146,9 @@ class Search:
             self.config = replace(config, low=here + retreat)
         else:
             self.config = replace(config, high=here - retreat)
-        low, high = max(first, self.config.low), min(last, self.config.high)
-        if high - low < 2 * config.tolerance:
-            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
-        return low, high
+        left = replace(self.config, low=max(first, self.config.low), high=min(last, self.config.high))
+        left.check_left()
+        return left.low, left.high
 
 
 class PeakSearch(Search):

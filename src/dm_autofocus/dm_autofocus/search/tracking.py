@@ -9,7 +9,7 @@ believed already weighs as a normal distribution of both.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ IMAGES, FEWEST = 5, 3
 REACH, GRID = 12.0, 0.25
 #: Changes of speed that are tried at each image, in depths of focus per second.
 SPEEDS = 5.0 * np.arange(-3, 4)
+#: How far the range ends before what the mirror refuses, at least, in depths of focus.
+STEP_BACK = 0.25
 #: Standard deviations of what is believed of place [depths of focus] and speed [depths of focus per second].
 PLACE_SIGMA, SPEED_SIGMA = 3.0, 8.0
 #: Share by which the period follows each image, and longest one that counts [s].
@@ -101,6 +103,24 @@ class Tracker:
                 self._move()
             offset = (0.0, -self._dither, self._dither)[len(self._trial)]
             self.step = Step(self._inside(self.centre + offset))
+
+    def refuse(self, low: float, high: float) -> None:
+        """Report that the mirror cannot take `step`: the range ends before it.
+
+        Args:
+            low, high: what it reaches now, about [1/m]; NaN = not known.
+
+        Raises:
+            ValueError: hardly anything of the range is left.
+        """
+        search, here = self._search, self.step.curvature
+        if here < (low + high) / 2:
+            self._search = replace(search, low=max(here + STEP_BACK * search.tolerance, low))
+        else:
+            self._search = replace(search, high=min(here - STEP_BACK * search.tolerance, high))
+        self._search.check_left()
+        self._trial.clear()
+        self.centre, self.step = self._inside(self.centre), Step(self._inside(here))
 
     def _inside(self, place: float) -> float:
         return min(max(place, self._search.low), self._search.high)

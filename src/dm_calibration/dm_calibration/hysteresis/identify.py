@@ -121,7 +121,7 @@ def identify(
         whole = whole or problem.fit(train)
         if not whole.candidate.own and whole.candidate.slopes:
             fading.append(whole)
-        slope = law_shape.slope_min(whole.law, *run.reach)
+        slope = law_shape.slope_min(whole.law, *run.reach).min()
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return
@@ -152,7 +152,7 @@ def identify(
             near = [fit for fit in near if fit.candidate.kind == candidate.kind]
             if near and candidate.slopes:
                 near += [fit for fit in fading if all(fit is not other for other in near)]
-            for own, whole in _begun(run, candidate, near, scatter, train):
+            for own, whole in _begun(run, candidate, near, scatter, train, slope_min):
                 consider(own, whole)
                 if candidate.name not in refused:
                     break
@@ -170,7 +170,7 @@ def identify(
 
 
 def _begun(
-    run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Rows
+    run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Rows, slope_min: float
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
     """Own laws that begin with each of the common ones `starts`, fitted to the rows `keep`, in the order to be tried.
 
@@ -179,7 +179,7 @@ def _begun(
     Then come those that keep the Duhem operator they begin with, the same for all actuators, and at last laws that
     differ less between actuators.
     """
-    fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter) for fit in starts))
+    fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
         made = list(fitted)
         left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
@@ -189,7 +189,7 @@ def _begun(
             yield own, own.fit(keep, own_fading=False)
     else:
         yield from fitted
-    for own in (OwnLaws(run, candidate, fit.law, scatter, ALIKE) for fit in starts):
+    for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min, ALIKE) for fit in starts):
         yield own, own.fit(keep, own_fading=False)
 
 

@@ -39,7 +39,7 @@ from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
-from dm_common.hysteresis.law_shape import normalised
+from dm_common.hysteresis.law_shape import normalised, slope_min
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 Rows = NDArray[np.bool_]
@@ -71,6 +71,9 @@ SPREAD = 0.1
 #: The same where laws cannot be inverted otherwise: one of many may fall where hardly a map shows it. On a mirror with
 #: 100 maps 95 % of the requests were within 15 nm then, and within 55 with one law for all.
 ALIKE = 0.05
+#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps, none of which
+#: leaves less than this of it: one of many may fall where hardly a map shows it.
+SHRINKS, SHRUNK = 4, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +99,20 @@ class OwnLaws:
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
+        slope_min: of each law, see SHRUNK.
         spread: of the patterns between actuators.
     """
 
     def __init__(
-        self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, spread: float = SPREAD
+        self,
+        run: Run,
+        candidate: Candidate,
+        common: HysteresisModel,
+        scatter: Floats,
+        slope_min: float,
+        spread: float = SPREAD,
     ) -> None:
-        self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
+        self.run, self._scatter, self._slope, self._slope_min = run, scatter, common.duhem_slope, slope_min
         self.candidate = candidate
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
@@ -157,8 +167,19 @@ class OwnLaws:
                     patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
                     slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
                     patterns = patterns[: own + 1]
-        patterns, creep, scatter, residual = self._rounds(self._features(slope), keep, patterns, creep, scatter)
-        return OwnFit(self.candidate, self._law(patterns, creep, slope), residual, patterns, creep, scatter)
+        features = self._features(slope)
+        patterns, creep, scatter, residual = self._rounds(features, keep, patterns, creep, scatter)
+        law = self._law(patterns, creep, slope)
+        for _ in range(SHRINKS):
+            steep = slope_min(law, *self.run.reach)
+            flat = steep < self._slope_min
+            if not flat.any() or (share := (1.0 - self._slope_min) / (1.0 - steep[flat])).min() < SHRUNK:
+                break
+            patterns[1:, flat] *= 0.999 * share
+            law = self._law(patterns, creep, slope)
+            crept = self._with_creep(features, creep, patterns)
+            residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)[1]
+        return OwnFit(self.candidate, law, residual, patterns, creep, scatter)
 
     def _features(self, slope: Floats) -> Floats:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""

@@ -14,7 +14,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
 from dm_common import Floats
-from dm_common.figures import in_nanometres, rounded
+from dm_common.figures import in_nanometres, rounded, told_from
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
@@ -56,7 +56,8 @@ class Forecast:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
         source = ", by data sheets and mirrors drawn at random, some of them twice as far off" if drawn else ""
-        right = f"moves then right to {in_nanometres(self.max_zernike)} (largest coefficient, 95 %{source})"
+        reached = told_from(self.max_zernike, until if missed else 0.0)
+        right = f"moves then right to {reached} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"
 
 
@@ -196,4 +197,4 @@ class GoodEnough:
         if found <= self._until:
             return f"{in_nanometres(self._until)} is reached: {in_nanometres(found)}{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{in_nanometres(self._until)} is not reached, {in_nanometres(found)} is: {reason}{parts}"
+        return f"{in_nanometres(self._until)} is not reached, {told_from(found, self._until)} is: {reason}{parts}"

@@ -22,7 +22,7 @@ from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.law_shape import certain_limits
 from dm_common.limits import Limits
-from dm_common.optics.conic import conic_coefficients, reachable_range
+from dm_common.optics.conic import conic_coefficients, range_text, reachable_range
 from dm_common.optics.zernike import PISTON_TILT
 
 #: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
@@ -100,14 +100,16 @@ def certificate(
     low, high, predicted = spheres(calibration)
     until, reason = valid_until(checks, calibration.promise, calibration.stamp_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
-    reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
+    reach = "neither flat nor mid range is within reach"
+    if np.isfinite(low):
+        reach = f"{range_text(low, high, '1/m', 3)} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
     within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
     usual = f"largest coefficient error within {within} for half the spheres in the range"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
-        ("range of curvatures", reach if np.isfinite(low) else "neither flat nor mid range is within reach"),
+        ("range of curvatures", reach),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"),
         ("predicted", f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends" if np.isfinite(low) else "not known"),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),

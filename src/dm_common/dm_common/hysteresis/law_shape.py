@@ -17,8 +17,8 @@ STEPS = 81
 PLACES = 41
 
 
-def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> float:
-    """Smallest slope of the effective signal over signals of `low` .. `high`, on any way.
+def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
+    """Smallest slope of the effective signal over signals of `low` .. `high`, on any way, of each law: (1,) or (N,).
 
     After a turn the operators set in one by one, narrow ones first; those of half-width r have set in only where the
     turn can lie 2 r behind.
@@ -30,7 +30,7 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> flo
     if parts.fading is not None:
         slope = slope + _fading_slope(parts.fading, law.actuators or 1, signals, parts.radius)
     dead_zone = 0.0 if parts.radius[0] else np.inf  # before anything has set in, also without an end
-    return float(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min())
+    return np.asarray(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min(axis=(0, 2, 3)))
 
 
 def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:

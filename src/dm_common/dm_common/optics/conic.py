@@ -135,3 +135,16 @@ def reachable_range(reached: Callable[[float], bool], middle: float, stroke: flo
         return near
 
     return edge(start - stroke), edge(start + stroke)
+
+
+def range_text(low: float, high: float, unit: str, digits: int = 4) -> str:
+    """What may be asked for, such as -0.0512 to +0.0499 1/m: rounded inwards, so that both ends may be too.
+
+    A range that is too narrow for so many `digits`, or has no ends, is given as it is.
+    """
+    if math.isfinite(low) and math.isfinite(high):
+        scale = 10.0**digits
+        least, most = math.ceil(low * scale - 1e-6) / scale, math.floor(high * scale + 1e-6) / scale
+        if least <= most:
+            low, high = least, most
+    return f"{low:+.{digits}f} to {high:+.{digits}f} {unit}"

@@ -68,10 +68,9 @@ def make_executor(node: Node) -> Executor:
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Dispatch events until the ROS context is shut down or `until()` is true.
+    """Dispatch events until the ROS context is shut down or `until()` is true. Lifecycle nodes start themselves first.
 
-    A callback that raises is logged with its traceback and the loop goes on. Lifecycle nodes start by themselves
-    before the first request is served.
+    A callback that raises is logged with its traceback and the loop goes on.
     """
     context = executor.context
     for node in executor.get_nodes():
@@ -149,6 +148,11 @@ class BackgroundExecutor:
         self._thread = threading.Thread(target=spin, args=(self._executor, lambda: self._stop), daemon=True)
         self._thread.start()
 
+    @property
+    def is_here(self) -> bool:
+        """Whether its thread is the one that asks: whoever waited there would wait for itself."""
+        return threading.current_thread() is self._thread
+
     def destroy_node(self) -> None:
         """Stop serving and take the node, with all it published, out of the ROS graph."""
         self._stop = True
@@ -196,8 +200,7 @@ def run_node(make_node: Callable[[], Node]) -> int:
 
     Returns the exit status: 0, or 1 when the node could not be made (the reason is on standard error).
     """
-    # Until the executor takes the signals over, SIGTERM must end the process by the same path as Ctrl-C, and so must
-    # SIGINT, which a shell's background job begins with ignoring.
+    # Until the executor takes them over, both end the process as Ctrl-C does; a shell's background job ignores SIGINT.
     for number in STOPPING:
         signal.signal(number, signal.default_int_handler)
     node: Node | None = None
@@ -212,6 +215,9 @@ def run_node(make_node: Callable[[], Node]) -> int:
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals(executor)
+        from dm_common.ros import stall  # a process only: whoever imports a node has no use for it
+
+        stall.watch()
         # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()
         gc.freeze()

@@ -199,7 +199,7 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         return None
     from dm_common.hysteresis.law_shape import slope_min, span  # a start does not wait for it
 
-    slope = slope_min(law, limits.low, limits.high)
+    slope = slope_min(law, limits.low, limits.high).min()
     if not slope > 0.0:
         raise ValueError(
             f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"

@@ -263,7 +263,7 @@ def calibrate(
         except BaseException as error:
             if (response := getattr(error, "response", None)) is not None:
                 show_result(response)
-                if write is not None and source is not None and response.parameters:
+                if write is not None and source is not None and response.poke_findings:
                     write_parameters(response.parameters, write, source, namespace, nodes_of_suite(client))
             if fresh:  # refused or interrupted before it began, it would hold for somebody else's goal
                 with suppress(DeformableMirrorError):

@@ -16,16 +16,21 @@ from dm_tools.output import (
     write_json,
 )
 from dm_tools.running_suite import (
+    BUSY_S,
     REPORT_S,
     hear_health,
     kept,
     naming_holder,
+    nodes_of_suite,
     promise_of,
     running_suite,
     settled_shape,
     unknown_history,
     verdict,
 )
+
+#: From so much on it is said that an error is predicted, m.
+MENTIONED = 0.5e-9
 
 
 def check(
@@ -55,15 +60,17 @@ def check(
         health = hear_health(client)
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
-        # What the shape that stands was promised, and not what the calibration promises of any.
-        client.wait(lambda: "focus_controller" in health, REPORT_S)
+        # What the shape that stands was promised, and not what the calibration promises of any; of that what is beyond
+        # its prediction, which the map is compared with.
+        patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
+        client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
     shape, capabilities = settled_shape(health), client.messages.get("capabilities")
     # The map is compared by the history that the node `calibration` knows, which may have run for longer.
     lost = unknown_history(capabilities)
     if lost or capabilities is None:  # what a focus controller would promise who knows as much
         promised = promise_of(calibration)
     else:
-        promised = shape.bound if shape is not None else capabilities.error_bound
+        promised = shape.bound - shape.predicted if shape is not None else capabilities.error_bound
     if forget:
         console.print(response.message)
     else:
@@ -73,7 +80,8 @@ def check(
                 f"shape that was asked for: focus_controller does not know their history ({lost})[/]",
                 soft_wrap=True,
             )
-        console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
+        beyond = " beyond what is predicted" if shape is not None and shape.predicted >= MENTIONED else ""
+        console.print(f"largest coefficient{beyond}: {verdict(promised, response.max_zernike)}")
         console.print(two_fold(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
         if not response.accepted:
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)

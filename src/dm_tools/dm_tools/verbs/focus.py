@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import two_fold
+from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import REPORT_S, naming_holder, promise, running_suite
 
@@ -87,7 +88,7 @@ def _show(state: Any, calibration: Any) -> None:
     console.print(
         f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
         f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient; "
-        f"reachable {state.curvature_min:+.4f} to {state.curvature_max:+.4f} 1/m",
+        f"reachable {range_text(state.curvature_min, state.curvature_max, '1/m')}",
         soft_wrap=True,
     )
     if calibration is not None:

@@ -1,10 +1,12 @@
 """`dm status`: the running suite on one screen."""
 
+import math
 import time
 from typing import Any
 
 from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
+from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
     NEEDED,
@@ -111,7 +113,7 @@ def _promise(capabilities: Any) -> str:
         return f"none now: {capabilities.message}"
     return (
         f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
-        f"from {capabilities.curvature_min:+.4f} to {capabilities.curvature_max:+.4f} 1/m; each move says its own"
+        f"from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move says its own"
     )
 
 
@@ -119,6 +121,7 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
     if capabilities is None or calibration is None or capabilities.error_code:
         return "not known"
     farthest = max(capabilities.curvature_min, capabilities.curvature_max, key=abs)
+    farthest = math.trunc(1e4 * farthest) / 1e4  # as the range is told
     return f"{two_fold(capabilities.error_bound, calibration, farthest)}, at {farthest:+.4f} 1/m"
 
 
