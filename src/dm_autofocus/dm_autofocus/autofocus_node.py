@@ -19,6 +19,7 @@ from dm_autofocus.probe_action import ready_capabilities
 from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.optics.conic import range_text
 from dm_common.ros import qos
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import run_node
@@ -111,9 +112,9 @@ class AutofocusNode(ManagedNode):
     def _range_text(self, capabilities: Capabilities) -> str:
         low, high = self._dioptres(capabilities)
         if high <= 0:
-            return f"beyond infinity only ({low:+.4f} to {high:+.4f} dioptre): check optics.rest_distance"
+            return f"beyond infinity only ({range_text(low, high, 'dioptre')}): check optics.rest_distance"
         far = f"{1 / low:.2f} m" if low > 0 else "infinity"
-        return f"from {1 / high:.2f} m to {far} ({low:+.4f} to {high:+.4f} dioptre)"
+        return f"from {1 / high:.2f} m to {far} ({range_text(low, high, 'dioptre')})"
 
     # --- state ---
 

@@ -92,8 +92,8 @@ class CameraFocusClient(DeformableMirrorClient):
         **claim: Unpack[Claim],
     ) -> None:
         """Search the sharpest focus in a region as `autofocus`, and stay on it for so many seconds."""
-        if not seconds >= 0:
-            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"seconds = {seconds}: must be 0 or more")
+        if not (isinstance(seconds, float | int) and seconds >= 0):
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"seconds = {seconds!r}: must be a number, 0 or more")
         goal = filled(Autofocus.Goal, region=region, track=True, **claim)
         ends = math.inf
 

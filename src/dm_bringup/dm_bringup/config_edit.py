@@ -28,8 +28,9 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
             text = _with_value(text, key, name, value)
     if _sections(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
-    for node in changes:
-        values_in(expected, node, namespace)
+    for node, values in changes.items():
+        if not values.items() <= values_in(expected, node, namespace).items():
+            raise ConfigError(f"a later section of this file overrules {dict(values)} of {node}: put them in by hand")
     return text
 
 
@@ -87,5 +88,9 @@ def _node_name(key: str) -> str:
 
 
 def _literal(value: Any) -> str:
-    """`value` on one line of YAML."""
-    return yaml.safe_dump(value, default_flow_style=True, width=10**6).removesuffix("\n").removesuffix("\n...")
+    """`value` on one line of YAML; texts that ROS would take for numbers in quotes."""
+    for style in (None, '"'):
+        text = yaml.safe_dump(value, default_flow_style=True, default_style=style, width=10**6)
+        if read_yaml(text) == value:
+            break
+    return text.removesuffix("\n").removesuffix("\n...")

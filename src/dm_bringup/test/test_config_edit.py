@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -104,6 +105,19 @@ def test_a_change_that_a_later_section_would_overrule_is_refused() -> None:
     text = "/left/pdm_driver: {ros__parameters: {a: 1}}\n/**: {ros__parameters: {mirror.wiring: trihex}}\n"
     with pytest.raises(ConfigError, match=r"mirror\.wiring: 'trihex' overrules 'custom' of /left/pdm_driver"):
         edited(text, CHANGES, "left")
+
+
+@pytest.mark.parametrize("later", ["/**/pdm_driver", "/pdm_driver"])
+def test_a_change_that_a_section_of_as_many_nodes_would_overrule_is_refused(later: str) -> None:
+    text = f"pdm_driver: {{ros__parameters: {{a: 1}}}}\n{later}: {{ros__parameters: {{a: 1}}}}\n"
+    with pytest.raises(ConfigError, match=r"a later section of this file overrules \{'a': 2\} of pdm_driver"):
+        edited(text, {"pdm_driver": {"a": 2}})
+
+
+@pytest.mark.parametrize("value", ["1e5", ["1e5", "b"], "a", 1e-7, True, "true", "0.5"])
+def test_texts_stay_texts(value: Any) -> None:
+    found = sections(edited("", {"pdm_driver": {"mirror.serial": value}}))["/**/pdm_driver"]["mirror.serial"]
+    assert found == value and type(found) is type(value)
 
 
 def test_what_is_no_parameter_file_is_refused() -> None:

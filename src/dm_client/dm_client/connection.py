@@ -35,6 +35,7 @@ RESTING = (
     ErrorCode.DRIVER_UNAVAILABLE,
     ErrorCode.ELECTRONICS_UNREACHABLE,
 )
+CLOSED = "the client has been closed"
 #: What a ROS domain may be.
 DOMAINS = range(233)
 #: Two connections of one process need two names.
@@ -90,6 +91,8 @@ class Connection:
         clients: {name: client of the service or action}.
     """
 
+    _closed = False
+
     def __init__(
         self,
         name: str,
@@ -111,7 +114,6 @@ class Connection:
         self.node = Node(own, namespace=place, context=self._context, cli_args=rules)
         self.messages: dict[str, Any] = {}
         self._heard: set[str] = set()
-        self._closed = False
         self._on_message, self._timeout_s = on_message, timeout_s
         self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
@@ -129,7 +131,12 @@ class Connection:
         atexit.register(self.close)  # the interpreter aborts where the thread still runs
 
     def close(self) -> None:
-        """Leave the ROS graph; the mirror keeps its shape. Who still waits for an answer in another thread is told."""
+        """Leave the ROS graph; the mirror keeps its shape. Who still waits for an answer in another thread is told.
+
+        Raises DeformableMirrorError inside a callback, which it would wait for.
+        """
+        if self._background.is_here:
+            raise DeformableMirrorError(ErrorCode.BUSY, "close: not while a callback runs: call it from another thread")
         self._closed = True
         atexit.unregister(self.close)
         self._background.destroy_node()
@@ -140,6 +147,7 @@ class Connection:
 
         Raises DeformableMirrorError where it cannot be the name of one.
         """
+        self._check_open()
         if topic in self._heard:
             return False
         self._heard.add(topic)
@@ -157,13 +165,21 @@ class Connection:
         return True
 
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
-        """Wait until `condition()` is true; False when it was not in time."""
+        """Wait until `condition()` is true; False when it was not in time.
+
+        Raises DeformableMirrorError once the client is closed.
+        """
         deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
         while not condition():
+            self._check_open()
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.005)
         return True
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeformableMirrorError(ErrorCode.CANCELED, CLOSED)
 
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
         """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
@@ -230,9 +246,7 @@ class Connection:
     @contextmanager
     def _answered(self, name: str) -> Iterator[Callable[[], str]]:
         """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
-        closed = "the client has been closed"
-        if self._closed:
-            raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {closed}")
+        self._check_open()
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
             raise DeformableMirrorError(ErrorCode.BUSY, text)
@@ -242,13 +256,13 @@ class Connection:
         lost = server.since_now() if server is not None else lambda: ""
 
         def gone() -> str:
-            return closed if self._closed else lost()
+            return CLOSED if self._closed else lost()
 
         try:
             yield gone
         except Exception as error:
             if self._closed:  # whatever rclpy says of what is destroyed
-                raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {closed}") from error
+                raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {CLOSED}") from error
             if not isinstance(error, ServiceCallError):
                 raise
             code, text = error.error_code, str(error)

@@ -20,7 +20,7 @@ from dm_common.errors import ErrorCode
 def client(driver: int, able: int | None) -> DeformableMirrorClient:
     """One that has heard this state of the driver and this code of the controller; None = there is no controller."""
     heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
-    heard._closed, heard._background = False, SimpleNamespace(is_here=False)  # type: ignore[assignment]
+    heard._background = SimpleNamespace(is_here=False)  # type: ignore[assignment]
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
@@ -94,6 +94,7 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
     waits = [
         lambda mirror: mirror.focus(0.01),
         lambda mirror: mirror.move_focus(0.01),
+        lambda mirror: mirror.latest("calibration", 60.0),
     ]
     with DeformableMirrorClient(domain=domain, timeout_s=60.0) as mirror:
         told = list[str]()
@@ -111,7 +112,9 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
         thread.join(5.0)
     for way in waits:  # and who asks only now
         ask(way)
-    assert sorted(told) == sorted(2 * [f"{name}: the client has been closed" for name in ("move_focus", "set_focus")])
+    assert len(told) == 6 and all(text.endswith("the client has been closed") for text in told)
+    with pytest.raises(DeformableMirrorError, match="the client has been closed"):
+        mirror.hear("another", ActuatorState, 1)
 
 
 def test_what_asks_inside_a_callback_is_refused_at_once() -> None:

@@ -18,7 +18,7 @@ def told_from(length: float, other: float) -> str:
     """A length (m) with as many digits as tell it from one that it is compared with, two at least, such as 2.04 nm."""
     text, beside = in_nanometres(length), in_nanometres(other)
     for digits in (3, 4, 5):
-        if text != beside:
+        if text != beside or length >= 1e-6:
             return text
         text, beside = (f"{value * 1e9:.{digits}g} nm" for value in (length, other))
     return text if text != beside else in_nanometres(length)

@@ -25,7 +25,8 @@ class Careful(Node):
     def make_safe(self):
         print("safe", flush=True)
 
-stall.LOOK_S, stall.END_S, stall.wakes = 0.02, 1, lambda _tasks: {"1": 7}
+looks = iter(range(8))
+stall.LOOK_S, stall.END_S, stall.wakes = 0.02, 1, lambda _tasks: {"1": next(looks, 7)}
 executor.rclpy.try_shutdown = lambda: time.sleep(100.0)
 sys.exit(executor.run_node(Careful))
 """
@@ -50,7 +51,7 @@ def test_threads_that_wake_do_not_count_as_stuck(monkeypatch: pytest.MonkeyPatch
     task(2, "dds.ev.0", 8)
     task(3, "dds.ev.1", 8)
     assert stall.wakes(tmp_path) == {"2": 8, "3": 8}
-    looks, ended = [0], []
+    looks, ended, real = [0], list[int](), stall.wakes
 
     def wakes(_tasks: Path) -> dict[str, int]:
         looks[0] += 1
@@ -59,6 +60,12 @@ def test_threads_that_wake_do_not_count_as_stuck(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(stall, "wakes", wakes)
     stall._watch(0.0, lambda: ended.append(looks[0]), tmp_path)
     assert ended == [20 + stall.LOOKS]
+    assert not real(tmp_path / "none"), "no such system"
+    # A count that never changes tells nothing.
+    counts = iter([{"2": 5}] * 100 + [{}])
+    monkeypatch.setattr(stall, "wakes", lambda _tasks: next(counts))
+    stall._watch(0.0, lambda: ended.append(0), tmp_path)
+    assert len(ended) == 1
 
 
 def test_a_node_that_lives_wakes_up(domain: int, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ import os
 import re
 import struct
 import zlib
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +50,7 @@ class LastShape:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
 
     def claim(self) -> None:
-        """Keep other drivers of this unit on this machine from it, until :meth:`release`, :meth:`close` or the end.
+        """Keep other drivers of this record from the unit, until :meth:`close` or the end of the process.
 
         Raises:
             LinkError: one has it. A unit on UDP would take the frames of both.
@@ -63,12 +62,6 @@ class LastShape:
             raise LinkError("another driver on this machine is connected to this unit; waiting for its end") from error
         except OSError:  # a file system without locks
             return
-
-    def release(self) -> None:
-        """Let others have the unit."""
-        with suppress(OSError):
-            if self._descriptor >= 0:
-                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def load(self) -> Shape | None:
         """(N,) codes, the newest whole record; None when there is none for this number of actuators, or when it was

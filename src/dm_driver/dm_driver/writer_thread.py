@@ -271,7 +271,6 @@ class WriterThread:
 
     def _lose_link(self, reason: str) -> None:
         self._electronics.close()
-        self._last.release()
         with self._change:
             lost = self._link_up
             changed = lost or reason != self._fault

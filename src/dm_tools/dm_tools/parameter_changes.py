@@ -79,7 +79,7 @@ def write_parameters(
 
     Raises:
         ConfigError: `source` cannot be changed without losing its form.
-        OSError: it cannot be written; what stood at `target` still does.
+        OSError: it cannot be read any more, or not be written; what stood at `target` still does.
     """
     from dm_bringup.config_edit import edited, values_of
     from dm_common.atomic_write import write_whole
