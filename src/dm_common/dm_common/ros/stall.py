@@ -20,8 +20,8 @@ from rclpy.logging import get_logger
 TASKS, NAME = Path("/proc/self/task"), "dds.ev."
 #: Wall time between two looks, s, and how many in a row must see such a thread where it was, after it has been seen to
 #: wake. They wake up for each lease and at least at every announcement: each second by config/fastdds.xml of
-#: dm_bringup, every three without it. Looks are counted, and not the time: a process that was stopped, or a machine that
-#: slept, goes on where it was.
+#: dm_bringup, every three without it. Looks are counted, and not the time: a process that was stopped, or a machine
+#: that slept, goes on where it was.
 LOOK_S, LOOKS = 3.0, 15
 #: Time for the way to the safe shape, s; what takes longer is cut off, for nothing after it comes to an end.
 END_S = 15
