@@ -95,6 +95,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         srv.Measure,
         (
             "label: by hand",
+            "answer_only: true",
             "timeout: .nan",
             "timeout: .inf",
             "timeout: -1.0",

@@ -26,6 +26,7 @@ from dm_calibration.regression import error_prediction
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.errors import NO_CALIBRATION
 from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
@@ -111,7 +112,7 @@ def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
         return observer.call(PredictError, "predict_error", PredictError.Request(signals=doubles(signals)), 30)
 
     refused = predict(np.zeros(37))
-    assert refused.error_code == ErrorCode.NOT_CALIBRATED and "load one" in refused.message
+    assert refused.error_code == ErrorCode.NOT_CALIBRATED and NO_CALIBRATION in refused.message
     assert fit().error_code == ErrorCode.NOT_CALIBRATED
 
     load(observer, "whole")

@@ -23,6 +23,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.time import Time
 
+from dm_common.optics.conic import range_text
 from dm_common.ros import qos
 from focus_bench import MIRROR, Bench, calibration, mirror_info
 from linear_mirror import RADIUS
@@ -75,7 +76,7 @@ def test_dry_run_and_refusals_move_nothing(bench: Bench) -> None:
     assert not preview.state.applied
     far = bench.set_focus(curvature=1.0)
     assert far.error_code == ErrorCode.UNREACHABLE
-    assert f"{far.state.curvature_max:+.4f}" in far.message
+    assert range_text(far.state.curvature_min, far.state.curvature_max, "1/m") in far.message
     assert "curvature = +1.0000" in far.message
     not_a_number = bench.set_focus(curvature=float("nan"))
     assert not_a_number.error_code == ErrorCode.NOT_FINITE
