@@ -94,8 +94,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "measure": (
         srv.Measure,
         (
-            "label: by hand",
-            "answer_only: true",
+            "label: by hand, answer_only: true",
             "timeout: .nan",
             "timeout: .inf",
             "timeout: -1.0",

@@ -55,7 +55,7 @@ def test_it_tracks_from_the_end_of_the_search_on(lost_after: float | None, monke
         (lambda camera: camera.autofocus(curvature_range=(0.01,)), "curvature_range = .0.01,.: must be two curvatures"),
         (lambda camera: camera.focus_stack(curvature_range=None), "curvature_range = None: must be two curvatures"),
         (lambda camera: camera.autofocus(curvature_range=("low", 0.02)), "curvature_min = 'low': must be double"),
-        (lambda camera: camera.track(math.nan), "seconds = nan: must be 0 or more"),
+        (lambda camera: camera.track(math.nan), "seconds = nan: must be a number, 0 or more"),
         (lambda camera: camera.boresight((0.5, 0.5, 1.0, 1.0)), "region = .*: left, top, width, height"),
         (lambda camera: camera.boresight(None), "NoneType"),
         (lambda camera: camera.boresight((0.5, 0.5, 0.5, 0.5), pairs=1), "pairs = 1: must be 2 or more"),
