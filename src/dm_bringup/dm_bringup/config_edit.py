@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from dm_bringup.sections import EVERY, ConfigError, belongs, flat, read_yaml, values_in
+from dm_bringup.sections import EVERY, ConfigError, belongs, flat, node_of, read_yaml, values_in
 
 Changes = Mapping[str, Mapping[str, Any]]
 
@@ -36,7 +36,7 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
 
 def _key(keys: Collection[str], node: str, namespace: str) -> str:
     """The section for what concerns one mirror: its own, also a new one where it names namespaces, else of all."""
-    of_node = [key for key in keys if _node_name(key) == node and belongs(key, namespace)]
+    of_node = [key for key in keys if node_of(key) == node and belongs(key, namespace)]
     if namespace and any({*key.split("/")[:-1]} - {"", "*", EVERY} for key in keys):  # others may read what is of all
         own = f"/{namespace}/{node}"
         return next((key for key in of_node if f"/{key.strip('/')}" == own), own)
@@ -72,7 +72,7 @@ def _section(text: str, key: str) -> Any:
 
 def values_of(text: str) -> dict[str, dict[str, Any]]:
     """The values of a parameter file by nodes. Raises ConfigError."""
-    return {_node_name(key): values for key, values in _sections(text).items()}
+    return {node_of(key): values for key, values in _sections(text).items()}
 
 
 def _sections(text: str) -> dict[str, dict[str, Any]]:
@@ -81,10 +81,6 @@ def _sections(text: str) -> dict[str, dict[str, Any]]:
         return {str(key): flat(section["ros__parameters"]) for key, section in content.items()}
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"not a parameter file: {type(error).__name__}: {error}") from error
-
-
-def _node_name(key: str) -> str:
-    return key.rsplit("/", 1)[-1]
 
 
 def _literal(value: Any) -> str:

@@ -38,6 +38,11 @@ def read_yaml(text: str) -> Any:
         loader.dispose()
 
 
+def node_of(key: str) -> str:
+    """The node that the section `key` of a parameter file is for, in whatever namespace; EVERY = each."""
+    return key.rpartition("/")[2]
+
+
 def belongs(key: str, namespace: str) -> bool:
     """Whether the section `key` of a parameter file is for nodes in `namespace` ("" = any), with wildcards as in ROS.
 
@@ -59,7 +64,7 @@ def _steps(key: str) -> list[str]:
 
 def _covers(general: str, key: str) -> bool:
     """Whether the section `general` is for all nodes that `key` is for."""
-    names = [each.rpartition("/")[2] for each in (general, key)]
+    names = [node_of(each) for each in (general, key)]
     inside = "".join(f"/{step}" for step in _steps(key))
     return names[0] in (EVERY, names[1]) and re.fullmatch(_pattern(general), inside) is not None
 
@@ -73,7 +78,7 @@ def values_in(sections: Mapping[str, Mapping[str, Any]], node: str, namespace: s
     found: dict[str, Any] = {}
     given: dict[str, str] = {}  # the section that counts, by parameter
     for key, values in sections.items():
-        if key.rpartition("/")[2] not in (node, EVERY) or not belongs(key, namespace):
+        if node_of(key) not in (node, EVERY) or not belongs(key, namespace):
             continue
         for name, value in values.items():
             before = given.get(name, key)

@@ -14,7 +14,7 @@ from typing import Any, NoReturn, Self
 import yaml
 
 from dm_bringup.nodes import MODULES, NAMES, nodes_of, remapping
-from dm_bringup.sections import EVERY, ConfigError, belongs, flat, read_yaml, values_in
+from dm_bringup.sections import EVERY, ConfigError, belongs, flat, node_of, read_yaml, values_in
 from dm_common.ros import SUPERVISOR
 
 Config = dict[str, dict[str, Any]]
@@ -44,17 +44,18 @@ def load_config(path: Path, namespace: str = "") -> Config:
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
     sections: Config = {}
     for key, section in ((str(key), section) for key, section in content.items()):
-        name = key.rpartition("/")[2]
+        name = node_of(key)
         if not belongs(key, namespace):
             continue
         if name not in NAMES and name != EVERY:
             raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
-        if any("*" not in other + key and other.rpartition("/")[2] == name for other in sections):
+        if any("*" not in other + key and node_of(other) == name for other in sections):
             raise ConfigError(f"{path}: {key}: a second section of {name}; must be one, or chosen by --namespace")
-        sections[key] = _readable(f"{path}: {key}", flat(section["ros__parameters"]))
-    named = {key.rpartition("/")[2] for key in sections}
+        sections[key] = flat(section["ros__parameters"])
+        _check_readable(f"{path}: {key}", sections[key])
+    named = {node_of(key) for key in sections}
     if EVERY in named:  # also for nodes that run without a section of their own
         named = {node.name for node in nodes_of(named)}
     try:
@@ -63,8 +64,8 @@ def load_config(path: Path, namespace: str = "") -> Config:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values; what ROS does not read is a ConfigError."""
+def _check_readable(section: str, values: Mapping[str, Any]) -> None:
+    """Raise ConfigError of what ROS does not read."""
     for name, value in values.items():
         if value is None:  # written anew it would be `null`, a text to ROS
             raise ConfigError(f"{section}: {name}: must have a value, or be left out")
@@ -72,7 +73,6 @@ def _readable(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
         if len(kinds) > 1:
             text = 'must be of one type, as 0.0 and 2.5, or "--port" and "12"'
             raise ConfigError(f"{section}: {name} = {value}: {text}")
-    return dict(values)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -10,7 +10,7 @@ from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
-from dm_common.optics.conic import range_text
+from dm_common.optics.conic import curvatures_text
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
 from dm_controller.focus_controller import FocusController
@@ -173,7 +173,7 @@ def capabilities_message(
     low, high = active.reachable_range(FocusTarget(0.0), tolerance)
     if empty := nowhere(active, tolerance):
         message.error_code = ErrorCode.UNREACHABLE
-    sentences = [empty or f"{range_text(low, high, '1/m')} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"]
+    sentences = [empty or curvatures_text(low, high)]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"{HISTORY_UNKNOWN}{unknown}")
     dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == "dead"]

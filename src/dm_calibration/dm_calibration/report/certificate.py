@@ -22,7 +22,7 @@ from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.law_shape import certain_limits
 from dm_common.limits import Limits
-from dm_common.optics.conic import conic_coefficients, range_text, reachable_range
+from dm_common.optics.conic import conic_coefficients, curvatures_text, reachable_range
 from dm_common.optics.zernike import PISTON_TILT
 
 #: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
@@ -102,7 +102,7 @@ def certificate(
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = "neither flat nor mid range is within reach"
     if np.isfinite(low):
-        reach = f"{range_text(low, high, '1/m', 3)} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"
+        reach = curvatures_text(low, high, 3)
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
     within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
     usual = f"largest coefficient error within {within} for half the spheres in the range"

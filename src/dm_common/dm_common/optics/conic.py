@@ -137,6 +137,11 @@ def reachable_range(reached: Callable[[float], bool], middle: float, stroke: flo
     return edge(start - stroke), edge(start + stroke)
 
 
+def curvatures_text(low: float, high: float, digits: int = 4) -> str:
+    """A range of curvatures (1/m), and in brackets as optical power, see :func:`range_text`."""
+    return f"{range_text(low, high, '1/m', digits)} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"
+
+
 def range_text(low: float, high: float, unit: str, digits: int = 4) -> str:
     """What may be asked for, such as -0.0512 to +0.0499 1/m: rounded inwards, so that both ends may be too.
 

@@ -10,7 +10,7 @@ from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.optics.conic import conic_coefficients, conic_sag, range_text
+from dm_common.optics.conic import conic_coefficients, conic_sag, curvatures_text
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_common.values import Fields, real, reals, text
 
@@ -132,7 +132,7 @@ class FocusTarget:
                 "limits.signal_max and limits.neighbour_difference of pdm_driver, or allow a larger error"
             )
         else:
-            text = f"reachable: {range_text(low, high, '1/m')} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"
+            text = f"reachable: {curvatures_text(low, high)}"
         return (
             f"curvature = {self.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
             f"{error * 1e9:.1f} nm (allowed {allowed * 1e9:.1f} nm); {text}"

@@ -7,7 +7,7 @@ from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.optics.conic import range_text
+from dm_common.optics.conic import curvatures_text
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
@@ -109,7 +109,7 @@ class FocusCard:
         conditioned = capabilities.error_bound_conditioned
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
         self._text.show(
-            f"Reachable {range_text(*found, '1/m')} ({range_text(2 * found[0], 2 * found[1], 'dioptre', 3)}).\n"
+            f"Reachable {curvatures_text(*found)}.\n"
             f"95 % bound on a coefficient beyond what is predicted: {capabilities.error_bound * 1e9:.1f} nm{extra}."
         )
         if found != self._range:
