@@ -238,13 +238,11 @@ def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest
     """Of two laws at once a law without plays fades otherwise: own laws that began there erred three times as much."""
 
     class Own:
-        def __init__(
-            self, run: Any, candidate: Any, law: float, scatter: Any, least: float, spread: float = 1.0
-        ) -> None:
-            self.law = law + (spread < 1.0)  # 1 more = nearer to each other
+        def __init__(self, run: Any, candidate: Any, law: float, scatter: Any, least: float) -> None:
+            self.law = law
 
-        def fit(self, keep: Any, own_fading: bool = True) -> Any:
-            return SimpleNamespace(residual=np.full((4, 2), self.law), law=self.law if own_fading else -self.law)
+        def fit(self, keep: Any) -> Any:
+            return SimpleNamespace(residual=np.full((4, 2), self.law), law=self.law)
 
     monkeypatch.setattr("dm_calibration.hysteresis.identify.OwnLaws", Own)
     starts: Any = [SimpleNamespace(law=left) for left in (1.0, 0.99, 0.5)]
@@ -254,5 +252,5 @@ def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest
         begun: Any = _begun(run, candidate, starts, np.ones(2), np.ones(4, dtype=bool), 0.1)
         return [fit.law for _, fit in begun]
 
-    assert order(Candidate("fades", 30, 5, 4, own=True)) == [0.5, 1.0, 0.99, -1.0, -0.99, -0.5, -2.0, -1.99, -1.5]
-    assert order(Candidate("does not", 30, 5, 0, own=True)) == [1.0, 0.99, 0.5, -2.0, -1.99, -1.5]
+    assert order(Candidate("fades", 30, 5, 4, own=True)) == [0.5, 1.0, 0.99]
+    assert order(Candidate("does not", 30, 5, 0, own=True)) == [1.0, 0.99, 0.5]

@@ -187,5 +187,5 @@ def _remarks(found: Identification) -> tuple[str, ...]:
     if tried and not found.fit.candidate.own:
         sentences.append("Hysteresis: the maps do not tell the actuators' loops apart; all share one law.")
     sentences += [f"Hysteresis: {name} was not taken: {reason}." for name, reason in found.refused.items()]
-    sentences += filter(None, (found.quiet_remark,))
+    sentences += filter(None, (found.quiet_remark, found.changed_remark))
     return tuple(sentences)

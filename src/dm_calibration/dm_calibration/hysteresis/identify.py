@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
 from dm_calibration.hysteresis.excitation import MAPS_PER_ACTUATOR
-from dm_calibration.hysteresis.own_laws import ALIKE, OwnLaws
+from dm_calibration.hysteresis.own_laws import OwnFit, OwnLaws
 from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
@@ -74,6 +74,17 @@ class Identification:
             f"{TURNS_MIN} turns over {SWING_MIN:g} are needed in a run to show its own."
         )
 
+    @property
+    def changed_remark(self) -> str:
+        """Whose law was changed so that it can be inverted, as a sentence; "" = nobody's."""
+        if not isinstance(self.fit, OwnFit) or not self.fit.changed.any():
+            return ""
+        names = ", ".join(str(number + 1) for number in np.flatnonzero(self.fit.changed))
+        return (
+            f"Hysteresis: as found, the law of actuator{'s' if self.fit.changed.sum() > 1 else ''} {names} could not "
+            "be inverted safely; it was changed as little as that takes."
+        )
+
 
 def identify(
     run: Run,
@@ -89,8 +100,7 @@ def identify(
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
             hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all;
-            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next; then
-            all actuators fade as the common one does; at last they differ less.
+            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -176,8 +186,6 @@ def _begun(
 
     How hysteresis fades stays nearly as it begins, and a law without plays may begin far from what it is, or one that
     cannot be inverted near it: another than the first of `starts` comes first where it leaves much less.
-    Then come those that keep the Duhem operator they begin with, the same for all actuators, and at last laws that
-    differ less between actuators.
     """
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
@@ -185,12 +193,8 @@ def _begun(
         left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
         for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
             yield made[number]
-        for own, _ in made:
-            yield own, own.fit(keep, own_fading=False)
     else:
         yield from fitted
-    for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min, ALIKE) for fit in starts):
-        yield own, own.fit(keep, own_fading=False)
 
 
 def _contains(richer: Candidate, simpler: Candidate) -> bool:

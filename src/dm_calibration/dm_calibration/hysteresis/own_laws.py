@@ -60,20 +60,16 @@ LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
 ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
-#: Rounds of the three solutions in turn, of runs of so many maps. With 6 the slow creep is a third less true and
-#: held-out errors up to four times as large, with 60 hardly better. Shorter runs, whose maps tell gains and laws apart
-#: less well, come to rest as much later: of 100 maps errors are up to a quarter smaller with 60 rounds than with 20, on
-#: some mirrors a tenth larger.
+#: Rounds of the three solutions in turn, of runs of so many maps: with 6 slow creep is a third less true and held-out
+#: errors up to four times as large, with 60 hardly better. Of shorter runs as many more; of 100 maps 60 are best.
 ROUNDS, ROUNDS_MAPS = 20, 300
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
 SPREAD = 0.1
-#: The same where laws cannot be inverted otherwise: one of many may fall where hardly a map shows it. On a mirror with
-#: 100 maps 95 % of the requests were within 15 nm then, and within 55 with one law for all.
-ALIKE = 0.05
 #: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps, none of which
-#: leaves less than this of it: one of many may fall where hardly a map shows it.
-SHRINKS, SHRUNK = 4, 0.9
+#: leaves less than LEAST of it. Where more than a tenth would have to go and its Duhem operator is its own, it takes
+#: the common one first. One of many may fall where hardly a map shows it.
+SHRINKS, SHRUNK, LEAST = 4, 0.9, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +81,13 @@ class OwnFit(LawFit):
         creep: (J + L + 1, N) weights of the creep elements, what the first L of them add for loops, and the change of
             creep per unit of position.
         scatter: (D,) uncertainty of each response, from what these laws leave.
+        changed: (N,) whether a law was changed so that it can be inverted, see SHRUNK.
     """
 
     patterns: Floats
     creep: Floats
     scatter: Floats
+    changed: Rows
 
 
 class OwnLaws:
@@ -100,7 +98,6 @@ class OwnLaws:
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
         slope_min: of each law, see SHRUNK.
-        spread: of the patterns between actuators.
     """
 
     def __init__(
@@ -110,7 +107,6 @@ class OwnLaws:
         common: HysteresisModel,
         scatter: Floats,
         slope_min: float,
-        spread: float = SPREAD,
     ) -> None:
         self.run, self._scatter, self._slope, self._slope_min = run, scatter, common.duhem_slope, slope_min
         self.candidate = candidate
@@ -130,7 +126,7 @@ class OwnLaws:
         first = 1 + self._basis.shape[1]
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         count = signals.shape[1]
-        self._between = _alike(count, spread)
+        self._between = _alike(count, SPREAD)
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)
@@ -142,24 +138,19 @@ class OwnLaws:
         self._signal_states = self.run.creep_states(signals)
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
 
-    def fit(self, keep: Rows, start: LawFit | None = None, own_fading: bool = True) -> OwnFit:
-        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all.
-
-        Args:
-            own_fading: of those from no hysteresis: False keeps the common Duhem operator for all actuators; a single
-                actuator's is always that, since messages tell one weight with one slope for both ways.
-        """
+    def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
+        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
             patterns, creep = start.patterns, start.creep
-            scatter, slope = start.scatter, start.law.duhem_slope
+            scatter, slope, changed = start.scatter, start.law.duhem_slope, start.changed
         else:
             patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.
             creep = np.zeros((len(self._creep_root), actuators))
             creep[ELEMENTS] = self._creep if self._creeps else 0.0
-            scatter, slope = self._scatter, self._slope
-            if slope.size and own_fading and actuators > 1:
+            scatter, slope, changed = self._scatter, self._slope, np.zeros(actuators, dtype=bool)
+            if slope.size and actuators > 1:  # messages tell one weight with one slope for both ways
                 slope = padded_slope(slope, actuators)
                 own = self._linear.stop
                 for _ in range(DUHEM_ROUNDS):
@@ -167,19 +158,31 @@ class OwnLaws:
                     patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
                     slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
                     patterns = patterns[: own + 1]
-        features = self._features(slope)
-        patterns, creep, scatter, residual = self._rounds(features, keep, patterns, creep, scatter)
-        law = self._law(patterns, creep, slope)
-        for _ in range(SHRINKS):
-            steep = slope_min(law, *self.run.reach)
-            flat = steep < self._slope_min
-            if not flat.any() or (share := (1.0 - self._slope_min) / (1.0 - steep[flat])).min() < SHRUNK:
+        common = slope if isinstance(start, OwnFit) else padded_slope(self._slope, actuators)
+        while True:
+            features = self._features(slope)
+            patterns, creep, scatter, residual = self._rounds(features, keep, patterns, creep, scatter)
+            law = self._law(patterns, creep, slope)
+            worse = self._share_kept(law) < SHRUNK
+            if slope.ndim < 3 or not (worse := worse & (slope != common).any(axis=(1, 2))).any():
                 break
-            patterns[1:, flat] *= 0.999 * share
+            slope, changed = np.where(worse[:, None, None], common, slope), changed | worse
+            patterns[-1, worse] = 0.0
+        for _ in range(SHRINKS):
+            share = self._share_kept(law)
+            flat = share < 1.0
+            if not flat.any() or share.min() < LEAST:
+                break
+            patterns[1:, flat] *= 0.999 * share[flat]
+            changed = changed | flat
             law = self._law(patterns, creep, slope)
             crept = self._with_creep(features, creep, patterns)
             residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)[1]
-        return OwnFit(self.candidate, law, residual, patterns, creep, scatter)
+        return OwnFit(self.candidate, law, residual, patterns, creep, scatter, changed)
+
+    def _share_kept(self, law: HysteresisModel) -> Floats:
+        """(N,) share of its hysteresis that each law may keep to be inverted safely: 1 and more = all of it."""
+        return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.reach), 0.999)))
 
     def _features(self, slope: Floats) -> Floats:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""
