@@ -153,6 +153,7 @@ def run_and_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[RecordedRun, 
     return run, message, bag
 
 
+@pytest.mark.slow
 def test_a_calibration_made_again_is_the_same_to_the_last_bit(run_and_bag: tuple[RecordedRun, Any, BagReader]) -> None:
     _run, live, bag = run_and_bag
     session = read_session(bag)
@@ -163,6 +164,7 @@ def test_a_calibration_made_again_is_the_same_to_the_last_bit(run_and_bag: tuple
     assert np.array(live.influence_sag).tobytes() == again.fit.influence_sag.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_recording_of_rosbag2_gives_the_same_calibration(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path, storage: str

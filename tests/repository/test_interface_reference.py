@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from documentation import ROOT
 from studies.documentation.interfaces import LINE_MAX, wrapped
 
 
+@pytest.mark.slow
 def test_the_interface_page_is_what_the_code_says() -> None:
     """In a process of its own: it makes every node."""
     done = subprocess.run(

@@ -168,6 +168,7 @@ def test_surface_control_error_is_the_map_less_its_nominal_surface() -> None:
         surface_control_error(maps.sag, maps.applied, influence[:, 1:], maps.points)
 
 
+@pytest.mark.slow
 def test_cross_validation_finds_weights_where_they_help() -> None:
     found = weighting(rim_maps())
     assert found.surfaces == 40 and weighting(replace(rim_maps(), step=np.arange(42) // 2)).surfaces == 21
@@ -243,6 +244,7 @@ def test_pokes_stand_in_where_there_are_no_surfaces() -> None:
     assert 0.0 < weighting(one_sided).score_unweighted < np.inf  # of extrapolation, as nothing else is there
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("piston_tilt", [0.0, 1e-6])
 def test_azwreg_regresses_the_weighted_coefficients(piston_tilt: float) -> None:
     _plant, maps = linear_maps(piston_tilt=piston_tilt)
@@ -264,6 +266,7 @@ def test_azwreg_regresses_the_weighted_coefficients(piston_tilt: float) -> None:
     assert any("region weights" in sentence and "given" in sentence for sentence in fit.limitations)
 
 
+@pytest.mark.slow
 def test_azwreg_with_points_without_data() -> None:
     _plant, maps = linear_maps(piston_tilt=1e-6)
     options = FitOptions("AZWreg", epsilon=1e-15)
@@ -321,6 +324,7 @@ def make_calibration(identifier: str = "one") -> Calibration:
     return calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance(identifier, 1))
 
 
+@pytest.mark.slow
 def test_a_stored_calibration_is_fitted_again_with_either_method() -> None:
     stored = make_calibration()
     again = refit(stored, FitOptions("AZWreg"), [], Provenance("two", 2))

@@ -42,6 +42,7 @@ def test_weights_of_surfaces_follow_eq_8() -> None:
         surface_weights(flat)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_regressed_is_refused() -> None:
     with pytest.raises(TooFewMapsError, match="calibrate with the plan FULL"):
         fit_predictor(*calibrated_by_pokes())
@@ -71,6 +72,7 @@ def test_the_law_of_a_known_hysteresis_is_found() -> None:
     assert np.median(rms) < 0.4 * np.median(np.sqrt(np.square(linear) @ maps.points.weight))
 
 
+@pytest.mark.slow
 def test_an_actuator_that_never_moved_is_no_candidate() -> None:
     maps, _ = calibrated()
     maps = replace(maps, applied=maps.applied * (np.arange(37) != 4))
