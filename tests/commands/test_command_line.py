@@ -265,6 +265,13 @@ def test_who_holds_the_mirror_is_named() -> None:
         raise uncalibrated
 
 
+def test_the_status_says_what_the_controller_remarks_on_its_promise() -> None:
+    able = Capabilities(curvature_min=-0.04, curvature_max=0.05, error_bound=2e-9, message="-0.04 to +0.05 1/m")
+    assert verb_status._promise(able).endswith("each move says its own")
+    able.message += "; without actuator 5; calibrated 40 days ago"
+    assert "each move says its own; [yellow]without actuator 5; calibrated 40 days ago[/]" in verb_status._promise(able)
+
+
 def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:
     assert "promised 97 nm (95 % bound, λ/7), measured 1.3 nm: " in verdict(97e-9, 1.3e-9)
     assert "inside" in verdict(97e-9, 1.3e-9) and "outside" in verdict(1e-9, 1.3e-9)

@@ -13,6 +13,7 @@ import traceback
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ import pytest
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from dm_msgs.msg import ActuatorState
 from rclpy.node import Node
 
 from dm_bringup.nodes import NODES
@@ -296,6 +298,20 @@ def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
     told = (("electronics at 127.0.0.1:1", alone), ("electronics at 1", without), ("watched folder /maps", running))
     for check, others in told:
         assert held_by_the_nodes(check, refused, others._asdict()) == refused
+
+
+def test_a_driver_that_does_not_reach_its_unit_hides_nothing_of_what_is_wrong_with_it() -> None:
+    lost, well = ActuatorState.STATE_LINK_LOST, ActuatorState.STATE_ACTIVE
+    for state, reason in ((lost, "cannot open EDAC40: Connection refused"), (well, ""), (None, "")):
+        messages = {} if state is None else {"actuator_state": ActuatorState(driver_state=state, message=reason)}
+        client = SimpleNamespace(wait=lambda condition, _timeout_s: condition(), messages=messages)
+        assert doctor_machine.link_lost(client) == reason
+    refused = Finding("cannot open EDAC40: Connection refused", "check power")
+    running = Finding(f"pdm_driver, in the ROS domain 0{doctor_machine.LINK_LOST}no route", "switch it on")._asdict()
+    for check in ("electronics at 127.0.0.1:1", "serial port /dev/ttyUSB0"):
+        assert held_by_the_nodes(check, refused, running) == refused
+    ports = held_by_the_nodes("ports of the virtual bench", refused, running)
+    assert ports is not None and ports.note
 
 
 def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -519,12 +519,28 @@ def test_parameters_of_the_nodes_are_recorded(
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "store"), "poke_amplitude": 0.31})
     wait_until(lambda: "/calibration/get_parameters" in dict(observer.node.get_service_names_and_types()), 60, "node")
     with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
-        wait_until(lambda: recorder.counts.get(PARAMETER_EVENTS), 60, "parameters")
+        wait_until(lambda: recorder.nodes == 1, 60, "parameters")
     recorded_events = list(BagReader(tmp_path / "bag").read())
     assert recorded_events[0].log_time <= asked[0]
     told = [deserialize_message(each.data, ParameterEvent) for each in recorded_events]
     values = {each.name: each.value.double_value for event in told for each in event.new_parameters}
     assert values["poke_amplitude"] == 0.31 and values.keys() >= {parameter.name for parameter in PARAMETERS}
+
+
+def test_parameters_of_a_node_that_was_started_again_are_recorded_too(
+    start: Callable[..., Any], observer: Observer, domain: int, tmp_path: Path
+) -> None:
+    """A calibration that it makes is made again by these, and not by those it had before."""
+    own = {"calibration_folder": str(tmp_path / "store")}
+    node = start("dm_calibration", "calibration", own | {"poke_amplitude": 0.31})
+    with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
+        wait_until(lambda: recorder.nodes == 1, 60, "parameters")
+        assert node.stop() == 0
+        wait_until(lambda: "calibration" not in observer.node.get_node_names(), 60, "its end")
+        start("dm_calibration", "calibration", own | {"poke_amplitude": 0.35})
+        wait_until(lambda: recorder.nodes == 2, 60, "parameters anew")
+    values, _remarks = _parameters(BagReader(tmp_path / "bag"), "/calibration", time.time_ns())
+    assert values["poke_amplitude"] == 0.35
 
 
 def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_path: Path) -> None:
@@ -545,6 +561,18 @@ def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_pat
     with pytest.raises(ValueError, match=r"/actuator_state: the node \w+ publishes it here.*ROS_DOMAIN_ID"):
         play(bag, ["/actuator_state"], domain=domain)
     assert len(seen) == 10
+
+
+def test_what_another_program_said_keeps_nothing_from_being_published_again(domain: int, tmp_path: Path) -> None:
+    """Such as a recording of all topics holds."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for name, kind in (("/zernike", "dm_msgs/msg/ZernikeCoefficients"), ("/theirs", "their_msgs/msg/Thing")):
+            text = definition(kind) if name == "/zernike" else "int32 number\n"
+            writer.add_topic(Topic(name, kind, [offered(qos.STATE)], "INVALID"), text)
+            writer.write(name, serialize_message(ZernikeCoefficients()), 1)
+    bag, remarks = BagReader(tmp_path / "bag"), list[str]()
+    assert play(bag, replayed(list(bag.topics)), domain=domain, remark=remarks.append) == {"/zernike": 1}
+    assert remarks == ["/theirs is left out: message type their_msgs/msg/Thing: not installed here"]
 
 
 def test_a_driver_that_starts_meanwhile_ends_a_replay(observer: Observer, domain: int, tmp_path: Path) -> None:

@@ -108,17 +108,21 @@ def test_names_carry_the_namespace() -> None:
 
 
 def signed(folder: Path, profile: Profile, enclave: str) -> Path:
-    """Permissions as sros2 writes them, a key, and something in place of the signature."""
+    """Permissions as sros2 writes them, a key, and the texts alone in place of what is signed."""
     place = folder / "enclaves" / profile.path(enclave).lstrip("/")
     place.mkdir(parents=True)
     grant = "<validity><not_after>2099-01-01T00:00:00</not_after></validity><allow_rule>"
+    grant += f"<domains><id>{profile.domain}</id></domains>"
     for rule, topics in dds_topics(profile, enclave).items():
         listed = "".join(f"<topic>{topic}</topic>" for topic in sorted(topics))
         grant += f"<{rule}><topics>{listed}</topics></{rule}>"
     text = f"<dds><permissions><grant>{grant}</allow_rule><default>DENY</default></grant></permissions></dds>"
     (place / "permissions.xml").write_text(text)
-    for name in ("permissions.p7s", "governance.p7s", "cert.pem"):
+    for name in ("permissions.p7s", "cert.pem"):
         (place / name).write_text(text)
+    governance = folder / "enclaves" / "governance.p7s"
+    governance.write_text(governance.with_suffix(".xml").read_text())
+    (place / governance.name).symlink_to(governance)
     key = place / "key.pem"
     key.touch(0o600)
     return place
@@ -143,6 +147,8 @@ def test_a_keystore_that_keeps_to_the_profile(tmp_path: Path) -> None:
         ("permissions.xml", "DENY", "ALLOW", "the default must be DENY"),
         ("permissions.xml", "2099", "2019", "not valid any more since 2019-01-01"),
         ("permissions.p7s", "rt/mirror_info", "rt/others", "holds other permissions"),
+        ("permissions.xml", "<id>0<", "<id>7<", "for the ROS domain 7: must be 0"),
+        ("governance.p7s", "<id>0<", "<id>7<", "enclaves/governance.p7s: holds another governance than governance.xml"),
     ],
 )
 def test_permissions_that_do_not_keep_to_it(tmp_path: Path, file: str, old: str, new: str, words: str) -> None:

@@ -8,6 +8,7 @@ with DeformableMirrorClient() as mirror:
     print(f"{state.predicted_rms * 1e9:.1f} nm rms expected")
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Self, TypedDict, Unpack
@@ -87,7 +88,8 @@ class DeformableMirrorClient(Connection):
     Args:
         namespace: of the mirror, "" for none; that of the process it runs in does not count.
         domain: ROS domain; None = the environment's.
-        timeout_s: how long to wait for a service that should answer at once.
+        timeout_s: how long to wait for a service that should answer at once. What takes as long as the instrument or
+            the way takes has a limit of its own, none where it is infinite: there the node knows when to give up.
     """
 
     #: The nodes that it calls.
@@ -176,25 +178,25 @@ class DeformableMirrorClient(Connection):
         steps: int = 0,
         *,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
-        timeout_s: float = 200.0,
+        timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> Degauss.Result:
         """Remove the hysteresis and end at mid range; `steps` half-swings, 0 = as configured in the driver."""
         return self.run_action("degauss", filled(Degauss.Goal, steps=steps, **claim), on_feedback, timeout_s)
 
-    def measure(self, label: str = "", timeout_s: float = 60.0, *, answer_only: bool = False) -> Measure.Response:
-        """Take one map with the interferometer, which gives up after `timeout_s` and says why.
+    def measure(self, label: str = "", timeout_s: float = 0.0, *, answer_only: bool = False) -> Measure.Response:
+        """Take one map with the interferometer, which gives up after `timeout_s` (0 = as configured) and says why.
 
         With `answer_only` no other node hears of it, for maps of something else in the mirror's place.
         """
         request = filled(Measure.Request, label=label, timeout=timeout_s, answer_only=answer_only)
-        return self.call("measure", request, timeout_s + 5.0)
+        return self.call("measure", request, timeout_s + 5.0 if timeout_s else math.inf)
 
     def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:
         """Read one map file."""
         return self.call("ingest_file", filled(IngestFile.Request, path=path), timeout_s)
 
-    def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
+    def measure_map(self, label: str = "", timeout_s: float = 0.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
         if self.hear("surface_map", Image, qos.MAP):
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
@@ -216,7 +218,7 @@ class DeformableMirrorClient(Connection):
         dry_run: bool = False,
         forget: bool = False,
         without: Sequence[int] = (),
-        timeout_s: float = 70.0,
+        timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> UpdateCalibration.Response:
         """Compare the calibration in use with a map taken now, and let it improve the calibration unless `dry_run`.
@@ -254,7 +256,7 @@ class DeformableMirrorClient(Connection):
         tolerance: float = 0.0,
         max_maps: int = 0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
-        timeout_s: float = 600.0,
+        timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> Converge.Result:
         """Close the loop on the interferometer until the measured surface is the requested one."""
@@ -271,7 +273,7 @@ class DeformableMirrorClient(Connection):
         tolerance: float = 0.0,
         max_maps: int = 0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
-        timeout_s: float = 14400.0,
+        timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> BuildRecipes.Result:
         """Build a recipe for each curvature [1/m] on the bench, with `zernike` [m] added; they are stored."""
@@ -285,7 +287,7 @@ class DeformableMirrorClient(Connection):
         self,
         goal: Calibrate.Goal | None = None,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
-        timeout_s: float = 7200.0,
+        timeout_s: float = math.inf,
     ) -> Calibrate.Result:
         """Measure and store a calibration; by default the full plan, used at once."""
         return self.run_action("calibrate", goal or Calibrate.Goal(activate=True), on_feedback, timeout_s)

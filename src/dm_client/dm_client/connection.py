@@ -198,7 +198,7 @@ class Connection:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
         with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            response = call(self.clients[name], request, timeout_s, lambda: bool(gone()))
+            response = call(self.clients[name], request, timeout_s, lambda: bool(gone()), ready_s=self._timeout_s)
         return checked(response)
 
     def run_action(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,28 @@ def test_the_interferometer_keeps_the_time_of_a_measurement(monkeypatch: pytest.
     DeformableMirrorClient.__new__(DeformableMirrorClient).measure("night", timeout_s=7)
     ((name, request, waits),) = asked
     assert (name, request.timeout) == ("measure", 7.0) and waits > 7.0, "its answer says why"
+
+
+def test_what_takes_as_long_as_the_instrument_takes_is_not_given_up_before_its_node_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of 213 maps at 40 s each, which are two hours and more, or of one for which somebody presses a button."""
+    waits: dict[str, float] = {}
+
+    def asked(_self: Any, name: str, request: Any, *rest: Any) -> None:
+        assert name != "measure" or request.timeout == 0.0, "as configured"
+        waits[name] = rest[-1]
+
+    for way in ("call", "run_action"):
+        monkeypatch.setattr(DeformableMirrorClient, way, asked)
+    mirror = DeformableMirrorClient.__new__(DeformableMirrorClient)
+    mirror.measure()
+    mirror.update_calibration()
+    mirror.calibrate()
+    mirror.converge(0.0)
+    mirror.build_recipes([0.0])
+    mirror.degauss()
+    assert len(waits) == 6 and set(waits.values()) == {math.inf}
 
 
 @pytest.mark.parametrize("domain", [233, -1, "1"])

@@ -117,6 +117,14 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
         mirror.hear("another", ActuatorState, 1)
 
 
+def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -> None:
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    absent = SimpleNamespace(service_is_ready=lambda: False, srv_name="/measure")
+    asked._servers, asked.clients, asked._timeout_s = {}, {"measure": absent}, 0.1
+    with pytest.raises(DeformableMirrorError, match=r"no such service within 0\.1 s"):
+        asked.measure()
+
+
 def test_what_asks_inside_a_callback_is_refused_at_once() -> None:
     """Nobody would take the answer."""
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)

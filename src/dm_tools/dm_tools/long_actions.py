@@ -4,7 +4,6 @@ The console shows such goals, can cancel them and does not get in their way; com
 """
 
 import threading
-import time
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -22,8 +21,6 @@ from dm_common.ros import qos
 LONG = ("build_recipes", "calibrate", "converge")
 #: action_msgs/GoalStatus: accepted, executing, canceling.
 RUNNING = (1, 2, 3)
-#: A goal that says nothing for so long has lost its node, s. Nodes wait 60 s for a map.
-SILENCE_S = 150.0
 
 
 def warning_in(result: Any) -> str:
@@ -46,7 +43,6 @@ class ExternalGoals:
         self._running: bytes = b""
         self._own: set[bytes] = set()
         self._ended: set[bytes] = set()
-        self._heard = 0.0
         self._servers: set[bytes] = set()  # who has it, since the goal began
         self.goals = 0
         self.feedback: Any = None
@@ -70,8 +66,7 @@ class ExternalGoals:
     def running(self) -> bool:
         """Whether a goal runs that this console did not send."""
         with self._lock:
-            running, heard = self._running, self._heard
-            if not running or running in self._own or time.monotonic() - heard > SILENCE_S:
+            if not self._running or self._running in self._own:
                 return False
         known = self._node.get_publishers_info_by_topic(self._status_topic)
         there = {bytes(server.endpoint_gid) for server in known}
@@ -97,7 +92,7 @@ class ExternalGoals:
             newest = next((identity for identity, status in reversed(goals) if status in RUNNING), b"")
             if newest and newest != self._running:
                 self._begin(newest)
-            self._running, self._heard = newest, time.monotonic()
+            self._running = newest
 
     def _on_feedback(self, message: Any) -> None:
         identity, feedback = bytes(message.goal_id.uuid), message.feedback
@@ -111,7 +106,7 @@ class ExternalGoals:
                 self.residuals = []
             if feedback.residual_rms > 0.0 and (self.feedback is None or feedback.step != self.feedback.step):
                 self.residuals.append(float(feedback.residual_rms))
-            self.feedback, self._heard = feedback, time.monotonic()
+            self.feedback = feedback
 
     def _begin(self, identity: bytes) -> None:
         self._running, self.feedback, self._servers = identity, None, set()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
+import pytest
 from dm_msgs.action import Calibrate
 
 from console_stand_in import EXECUTING, SUCCEEDED, FakeNode, Goal
@@ -41,6 +43,15 @@ def test_a_goal_whose_node_has_gone_has_ended() -> None:
     assert watch.running
     node.servers = []
     assert not watch.running
+
+
+def test_a_goal_that_says_nothing_for_long_still_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While it fits, or waits for a map that somebody saves by hand."""
+    watch, node = watched()
+    Goal(node, 3).tell(EXECUTING)
+    later = time.monotonic() + 3600.0
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    assert watch.running
 
 
 def test_a_node_that_was_started_again_knows_nothing_of_the_goals_of_before() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import io
 import json
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -24,6 +26,7 @@ from dm_msgs.msg import (
     SurfaceMapInfo,
     ZernikeCoefficients,
 )
+from dm_msgs.srv import Measure
 from matplotlib.image import imread
 from nicegui import Client
 from nicegui.page import page as nicegui_page
@@ -35,7 +38,7 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import HysteresisObserver
 from dm_common.messages import applied_from, estimate_from, estimate_message
 from dm_common.optics.zernike import basis
-from dm_tools.console import console_node, status, view_models
+from dm_tools.console import console_node, operations, status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
 from dm_tools.console.charts.plots import INK, SAG_COLOURS, heat_map, loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import ConsoleNode, Snapshot
@@ -597,3 +600,15 @@ def test_recipes_are_spread_evenly() -> None:
 def test_recipes_that_make_no_sense_are_refused(first: float, last: float, number: float | None, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         view_models.evenly(first, last, number)
+
+
+def test_a_map_is_waited_for_as_long_as_the_interferometer_is_told_to_take() -> None:
+    waits: list[float] = []
+
+    async def call(_name: str, request: Measure.Request, timeout_s: float) -> Measure.Response:
+        waits.append(timeout_s)
+        assert request.timeout == 0.0, "as configured"
+        return Measure.Response(zernike=ZernikeCoefficients(coefficients=[0.0] * 21))
+
+    text = asyncio.run(operations.measure(SimpleNamespace(ros=SimpleNamespace(call=call))))  # type: ignore[arg-type]
+    assert waits == [math.inf] and "rms beyond tilt 0.0 nm" in text

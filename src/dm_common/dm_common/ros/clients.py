@@ -42,6 +42,7 @@ def call(
     cancelled: Callable[[], object] = lambda: False,
     again_s: float = math.inf,
     send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
+    ready_s: float = math.inf,
 ) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
@@ -51,20 +52,20 @@ def call(
         cancelled: ends the wait.
         again_s: without an answer the request is sent again after so long, once; for one that may be carried out twice.
         send_by: called with what sends the request, and returns what that does.
+        ready_s: longest wait for the server, where that is less.
 
     Raises:
-        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, `cancelled()` became true, or the
-            process ends.
+        ServiceCallError: no server or no answer in time, `cancelled()` became true, or the process ends.
     """
-    deadline = time.monotonic() + timeout_s
+    began, ready_s = time.monotonic(), min(ready_s, timeout_s)
+    deadline = began + timeout_s
     while not client.service_is_ready():
         if cancelled():
             raise ServiceCallError(f"{client.srv_name}: cancelled")
-        if time.monotonic() > deadline:
-            raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
+        if time.monotonic() > began + ready_s:
+            raise ServiceCallError(f"{client.srv_name}: no such service within {ready_s:g} s; is its node running?")
         time.sleep(0.02)
-    done = threading.Event()
-    answers: list[Any] = []
+    done, answers = threading.Event(), list[Any]()
 
     def answered(future: Any) -> None:
         answers.append(future.result())

@@ -1,6 +1,7 @@
 """The ROS side of the console: one node on a thread of its own, the latest messages, and calls as coroutines."""
 
 import asyncio
+import math
 import threading
 import time
 import uuid
@@ -46,8 +47,6 @@ LOG_LINES = 200
 SILENCE_S = 5.0
 #: Time for an answer that comes at once, s.
 ANSWER_S = 10.0
-#: Longest action, s.
-LONGEST_S = 7200.0
 #: Time that runs back by more than this is another time: a simulator that was started again, s.
 TIME_JUMP_S = 60.0
 
@@ -159,7 +158,7 @@ class ConsoleNode:
         except DeformableMirrorError as error:
             raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 
-    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = LONGEST_S) -> Any:
+    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = math.inf) -> Any:
         """Run an action to its end and return its result.
 
         Raises Refusal with the node's sentence when the goal was refused, ended with an error or was cancelled.

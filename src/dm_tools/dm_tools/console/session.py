@@ -1,13 +1,14 @@
 """What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
 
 import asyncio
+import math
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from dm_common.errors import Refusal
-from dm_tools.console.console_node import LONGEST_S, ConsoleNode, Snapshot
+from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import Loop
 from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
@@ -168,7 +169,7 @@ class Session:
         finally:
             self.progress = Progress()
 
-    async def run(self, action: str, goal: Any, timeout_s: float = LONGEST_S) -> Any:
+    async def run(self, action: str, goal: Any, timeout_s: float = math.inf) -> Any:
         """Run an action to its end, with its progress shown, and return its result. Raises Refusal."""
         return await self.ros.run(action, goal, lambda feedback: self.progress.take(action, feedback, goal), timeout_s)
 

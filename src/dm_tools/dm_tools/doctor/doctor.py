@@ -5,11 +5,11 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.doctor.machine import Finding, machine_checks
+from dm_tools.doctor.machine import LINK_LOST, Finding, machine_checks
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 
 #: Checks of what only one can have at a time: the nodes, while they run.
-EXCLUSIVE = ("electronics", "serial port", "ports of the virtual bench")
+PORTS, UNIT = ("ports of the virtual bench",), ("electronics", "serial port")
 
 
 def doctor(
@@ -47,7 +47,8 @@ def doctor(
 
 def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:
     """What a check has found, which is no more than a note where the nodes of the bench run and hold it."""
-    heard = (running or {}).get("problem", "").partition("; not running")[0]
-    if finding is None or not check.startswith(EXCLUSIVE) or "pdm_driver" not in heard:
+    said = (running or {}).get("problem", "")
+    held = PORTS if LINK_LOST in said else (*PORTS, *UNIT)
+    if finding is None or not check.startswith(held) or "pdm_driver" not in said.partition("; not running")[0]:
         return finding
     return finding._replace(cure="none, if that is for the nodes that run; ./dm status says how they are", note=True)

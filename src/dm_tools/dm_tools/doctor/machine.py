@@ -25,6 +25,8 @@ DISCOVERY_S = 3.0
 #: Commands that seem older than `limits.command_age` or further ahead than `limits.command_lead` are refused.
 CLOCK_SKEW_S = 0.5
 REPORTS_S = 2.5
+#: What is said of a driver that runs and does not reach its unit; the reason follows.
+LINK_LOST = "; the driver does not reach the electronics: "
 
 
 class Finding(NamedTuple):
@@ -156,6 +158,11 @@ def running_nodes(namespace: str = "") -> Finding:
             )
         if count and (skew := _skew(client)) is not None:
             return skew
+        if "pdm_driver" in count and (reason := link_lost(client)):
+            return Finding(
+                f"{', '.join(count)}, {place}{LINK_LOST}{reason}",
+                "switch the unit on and check its cable; ./dm doctor --config FILE looks for it",
+            )
     if lacking := [f"{name} ({effect})" for name, effect in NEEDED.items() if count and name not in count]:
         return Finding(
             f"{', '.join(count)}, {place}; not running: {', '.join(lacking)}",
@@ -189,6 +196,15 @@ def _skew(client: Any) -> Finding | None:
             "synchronise the clocks of both machines: sudo apt-get install chrony",
         )
     return None
+
+
+def link_lost(client: Any) -> str:
+    """Why the driver does not reach its unit; "" = it does, or says nothing."""
+    from dm_msgs.msg import ActuatorState
+
+    client.wait(lambda: "actuator_state" in client.messages, REPORTS_S)
+    state = client.messages.get("actuator_state")
+    return str(state.message) if state is not None and state.driver_state == ActuatorState.STATE_LINK_LOST else ""
 
 
 def disk(path: Path) -> Finding | None:

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Topic
-from dm_tools.recording.interfaces import message_class
+from dm_tools.recording.interfaces import UnknownTypeError, message_class
 from dm_tools.recording.recorder import COMMON
 
 #: Topics that would move a real mirror; published only when asked for.
@@ -58,7 +58,8 @@ def play(
 ) -> dict[str, int]:
     """Publish the topics `names` of the recording; returns the number of messages of each that was published.
 
-    Left out are topics whose type had another layout when they were recorded: its bytes would be read as nonsense.
+    Left out are topics whose type is not installed, or had another layout when they were recorded: its bytes would be
+    read as nonsense.
 
     Args:
         rate: times faster than recorded.
@@ -67,7 +68,6 @@ def play(
 
     Raises:
         ValueError: a rate that is not above 0, or the state of a driver where one runs.
-        UnknownTypeError: a message type that is not installed.
         BagError: the file is damaged.
     """
     if not rate > 0.0:
@@ -76,14 +76,18 @@ def play(
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     node = Node("dm_player", context=context)
     try:
-        publishers = {
-            name: node.create_publisher(message_class(bag.topics[name].type_name), name, _offer(bag.topics[name]))
-            for name in names
-        }
+        publishers = {}
+        for topic in [bag.topics[name] for name in names]:
+            try:
+                kind = message_class(topic.type_name)
+            except UnknownTypeError as error:  # a recording of all topics may hold those of any other program
+                remark(f"{topic.name} is left out: {error}")
+            else:
+                publishers[topic.name] = node.create_publisher(kind, topic.name, _offer(topic))
         time.sleep(DISCOVERY_S)
-        for name in names:
+        for name in publishers:
             _check_no_driver(node, name)
-        for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
+        for topic in [bag.topics[name] for name in publishers if _has_changed(node, bag.topics[name])]:
             node.destroy_publisher(publishers.pop(topic.name))
             remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")
         begun, first, counts = time.monotonic(), None, dict.fromkeys(publishers, 0)

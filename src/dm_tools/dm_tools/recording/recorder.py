@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import re
@@ -27,6 +28,8 @@ from dm_tools.recording.interfaces import UnknownTypeError, definition, message_
 
 #: How often new topics are looked for, s.
 DISCOVERY_PERIOD_S = 0.25
+#: A node that has just started may miss a question, or its answer be missed: it is asked again after so long, s.
+ASK_AGAIN_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
 #: Longest sleep of the executor, s; only bounds how soon it ends.
@@ -77,6 +80,7 @@ class Recorder:
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
         self._subscribed: set[str] = set()
         self._clients: dict[str, AsyncParameterClient] = {}
+        self._asked: dict[bytes, float] = {}  # by what publishes a node's parameter events: when it is asked again
         self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
         # The events executor cannot hand over messages as they came (it fails on raw subscriptions).
@@ -164,22 +168,30 @@ class Recorder:
 
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
+    @property
+    def nodes(self) -> int:
+        """How many nodes have told their parameters, one that was started anew counted again."""
+        return sum(again == math.inf for again in self._asked.values())
+
     def _ask_parameters(self) -> None:
-        """Ask nodes of the suite for their parameters, once each; answers arrive later."""
+        """Ask nodes of the suite for their parameters, once each, and each that is started anew; answers come later."""
         if PARAMETER_EVENTS not in self._subscribed:
             return
-        for name, namespace in self._node.get_node_names_and_namespaces():
-            path = f"{namespace.rstrip('/')}/{name}"
-            if name not in NAMES or path in self._clients or not path.startswith(self._namespace):
+        now = time.monotonic()
+        for publisher in self._node.get_publishers_info_by_topic(PARAMETER_EVENTS):
+            name, node = publisher.node_name, bytes(publisher.endpoint_gid)
+            path = f"{publisher.node_namespace.rstrip('/')}/{name}"
+            if name not in NAMES or now < self._asked.get(node, now) or not path.startswith(self._namespace):
                 continue
-            client = AsyncParameterClient(self._node, path)
-            if not client.services_are_ready():
+            if path not in self._clients:
+                self._clients[path] = AsyncParameterClient(self._node, path)
+            if not self._clients[path].services_are_ready():
                 continue
-            self._clients[path] = client
-            listed = client.list_parameters()
-            listed.add_done_callback(lambda future, path=path: self._on_listed(path, future))
+            self._asked[node] = now + ASK_AGAIN_S
+            listed = self._clients[path].list_parameters()
+            listed.add_done_callback(lambda future, path=path, node=node: self._on_listed(path, node, future))
 
-    def _on_listed(self, path: str, listed: Any) -> None:
+    def _on_listed(self, path: str, node: bytes, listed: Any) -> None:
         """Fetch the values of the names listed, one after another; they are recorded as if the node began now.
 
         Where one has no value, rclpy leaves out all that follow; and a service keeps ten requests at most.
@@ -194,6 +206,7 @@ class Recorder:
                 asked = self._clients[path].get_parameters([name])
                 asked.add_done_callback(lambda answer: keep(name, answer.result().values))
             else:
+                self._asked[node] = math.inf
                 self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, serialize_message(event), begun))
 
         def keep(name: str, answer: Sequence[Any]) -> None:

@@ -18,7 +18,13 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
     enclaves = profile.enclaves()
     for enclave in enclaves:
         found += _compare_text(profile.policy(folder, enclave), policy_xml(profile, enclave))
-    found += _compare_text(folder / "enclaves" / "governance.xml", governance_xml(profile))
+    governance = folder / "enclaves" / "governance.xml"
+    found += _compare_text(governance, governance_xml(profile))
+    # Nodes go by what was signed, which sros2 does once with the keystore; enclaves have links to it.
+    for signed in sorted({path.resolve() for path in governance.parent.rglob("governance.p7s")}):
+        if signed.is_file() and governance.is_file() and _plain(governance) not in _plain(signed):
+            cure = "remove it, and create_keystore signs it anew"
+            found.append(f"{signed}: holds another governance than {governance.name}: {cure}")
     expected = {profile.path(enclave).lstrip("/") for enclave in enclaves}
     for path in sorted((folder / "enclaves").rglob("permissions.xml")):
         place = path.parent.relative_to(folder / "enclaves").as_posix()
@@ -66,6 +72,8 @@ def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
         found.append(f"{signed}: missing")
     elif _plain(path) not in _plain(signed):
         found.append(f"{signed}: holds other permissions than {path.name}: sign them again")
+    if domains := {str(item.text) for item in document.iter("id")} - {str(profile.domain)}:
+        found.append(f"{path}: for the ROS domain {', '.join(sorted(domains))}: must be {profile.domain}")
     if [item.text for item in document.iter("default")] != ["DENY"] * len(list(document.iter("grant"))):
         found.append(f"{path}: the default must be DENY")
     for rule, wanted in dds_topics(profile, enclave).items():

@@ -151,8 +151,10 @@ def environment(profile: Profile, keystore: Path) -> str:
         f"export ROS_DOMAIN_ID={profile.domain}",
         "",
         "# Make the keys, once, on a machine with `ros2 security` (apt: ros-jazzy-sros2); again after each",
-        "# `dm security --out`, for the permissions. sros2 writes keys as the umask lets it:",
+        "# `dm security --out`, for governance and permissions. sros2 writes keys as the umask lets it, signs a",
+        "# governance only where none is signed, and permissions for the ROS_DOMAIN_ID of the shell:",
         "#   umask 077",
+        f"#   rm -f {shlex.quote(str(keystore / 'enclaves' / 'governance.p7s'))}",
         f"#   ros2 security create_keystore {store}",
     ]
     for enclave in profile.enclaves():

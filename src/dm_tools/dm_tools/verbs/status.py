@@ -111,9 +111,11 @@ def _promise(capabilities: Any) -> str:
         return "not known: focus_controller is not heard"
     if capabilities.error_code:
         return f"none now: {capabilities.message}"
+    remarks = capabilities.message.partition("; ")[2]  # behind the range
     return (
         f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
         f"from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move says its own"
+        f"{f'; [yellow]{remarks}[/]' if remarks else ''}"
     )
 
 
