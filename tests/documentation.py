@@ -226,6 +226,7 @@ PYTHON_ELSEWHERE = {
     ("camera.md", 1): "is examples/camera_focus.py, which test_autofocus_node.py runs",
     ("calibrate.md", 1): "is the beginning of examples/calibrate_folder.py, which test_calibrate.py runs",
     ("calibrate.md", 2): "is the beginning of examples/compare_laws.py, which test_any_measurement.py runs",
+    ("recipes.md", 1): "needs recipes; the goal is the one that test_console_operations.py sends",
 }
 
 

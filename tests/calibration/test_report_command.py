@@ -58,5 +58,9 @@ def test_an_id_or_a_file_anywhere_is_found(
     assert find_calibration(str(store.find("older")), elsewhere)[1] == store.find("older")
     with pytest.raises(ValueError, match="calibrate first"):
         find_calibration("", elsewhere)
+    monkeypatch.setattr(verb, "running_calibration", lambda _namespace: (None, JUDGED_BY, ""))
+    monkeypatch.setattr(verb, "STORES", (tmp_path / "bench", tmp_path / "hardware"))
+    with pytest.raises(ValueError, match=r"bench or .*hardware: calibrate first"):
+        report("", tmp_path / "out")
     with pytest.raises(ValueError, match="no such file"):
         find_calibration("older", elsewhere)

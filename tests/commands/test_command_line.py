@@ -406,6 +406,14 @@ def test_the_age_of_a_calibration_is_of_the_time_of_the_bench() -> None:
     assert "maps 60 s ago" in verb_status._calibration(made, 100)
 
 
+def test_status_says_where_only_of_what_is_absolute() -> None:
+    able = Capabilities(curvature_min=-0.05, curvature_max=0.04, error_bound=2e-9)
+    used = Calibration(id="a", wavelength=632.8e-9, aperture_radius=0.011)
+    assert verb_status._absolute(able, used).endswith("of the interferometer not given)")
+    used.instrument_error, used.scale_error = 1e-9, 1e-3
+    assert verb_status._absolute(able, used).endswith(", limited by the lateral scale, at -0.0500 1/m")
+
+
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
     said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))

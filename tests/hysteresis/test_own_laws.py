@@ -124,7 +124,26 @@ def test_own_laws_that_cannot_be_inverted_are_tried_again_from_the_next_common_o
     monkeypatch.setattr(law_shape, "slope_min", slope)
     coarser = replace(COMMON[1], name="coarser", plays=19)
     found = identify(run, check, (COMMON[0], coarser, *LAWS[1:]))
-    assert found.fit.candidate.own and not found.refused and begun.count(7) == 2
+    assert found.fit.candidate.own and not found.refused and begun.count(7) == 3  # and the final fit
+
+
+def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of 80 maps ended with a law that fell near an end that it had not come to: nobody could use it."""
+    run, check = relay_run(0.2, 14, 120)
+    assert run.in_use == run.reach
+    run = replace(run, limits=(-1.5, 0.1))
+    asked, falls = list[HysteresisModel](), 0
+
+    def slope(law: HysteresisModel, low: float, high: float) -> Floats:
+        assert (low, high) == (-1.5, run.reach[1])
+        asked.append(law)
+        return np.full(1, -1.0 if len(asked) == falls else 1.0)
+
+    monkeypatch.setattr(law_shape, "slope_min", slope)
+    assert identify(run, check, COMMON).fit.law is asked[-1]  # of all maps
+    falls, asked = len(asked), []
+    kept = identify(run, check, COMMON).fit.law
+    assert len(asked) == falls and any(kept is law for law in asked[:-1])
 
 
 def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_nothing() -> None:

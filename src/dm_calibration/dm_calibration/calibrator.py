@@ -117,7 +117,7 @@ def calibrate(
         now = time.time_ns()
         provenance = Provenance(new_id(mirror.name, mirror.serial, now), now)
     measured, options = outcome.maps(), options or FitOptions()
-    found = fit_hysteresis(measured) if StepKind.EXCITATION in measured.kind else None
+    found = fit_hysteresis(measured, limits=mirror.limits) if StepKind.EXCITATION in measured.kind else None
     fit = fit_effective(measured, found, options, mirror)
     check = check_fit(fit, mirror)
     limitations = [*fit.limitations, *(found.remarks if found else ()), *run_limitations]

@@ -369,12 +369,18 @@ def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: Recalib
 
 
 def test_several_bad_maps_in_a_row_tell_of_a_changed_mirror(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    reasons = [updates.take(bench.measure("bumped", bump=30e-9), bench.settled()).reason for _ in range(3)]
+    reasons, widened = list[str](), [updates.widened]
+    for _ in range(3):
+        reasons.append(updates.take(bench.measure("bumped", bump=30e-9), bench.settled()).reason)
+        widened.append(updates.widened)
     assert updates.mirror_changed
+    assert widened[0] == widened[3] == []  # in the end it is a doubt
+    assert widened[1] == ["The last map disagrees with this calibration: bounds are wider until one agrees."]
+    assert widened[2][0].startswith("The last 2 maps disagree with this calibration")
     assert "calibrate again" not in reasons[1]
     assert "3 maps in a row did: the mirror has changed: calibrate again" in reasons[2]
     assert updates.take(bench.measure("good"), bench.settled()).accepted
-    assert not updates.mirror_changed
+    assert not updates.mirror_changed and not updates.widened
 
 
 def test_maps_of_one_unmoved_mirror_count_for_less_and_less(bench: SteadyMirror, updates: RecalibrationManager) -> None:

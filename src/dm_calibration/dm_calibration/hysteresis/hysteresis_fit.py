@@ -17,6 +17,7 @@ from dm_calibration.influence.maps import MapSet, StepKind
 from dm_common import Floats
 from dm_common.hysteresis.inverse import random_histories
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 #: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
@@ -46,10 +47,15 @@ class HysteresisFit:
     remarks: tuple[str, ...]
 
 
-def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -> HysteresisFit:
+def fit_hysteresis(
+    maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES, limits: Limits | None = None
+) -> HysteresisFit:
     """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
 
     Maps of kind CHECK test the law before they join the final fit.
+
+    Args:
+        limits: of the signals; the law has an inverse between them. None = between the signals of the run.
 
     Raises:
         ExcitationError: the maps do not show hysteresis.
@@ -57,6 +63,8 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         ValueError: time stamps that run backwards.
     """
     run = run_of(maps)
+    if limits is not None:
+        run = replace(run, limits=(limits.low, limits.high))
     test = np.array([kind == StepKind.CHECK for kind in maps.kind])
     found, run = _without_outliers(run, test, candidates)
     covariance = _error_covariance(found, run.responses.coefficients, maps)

@@ -103,7 +103,7 @@ def identify(
             where it fades, with another if that leaves much less; where it cannot be inverted then, with the next.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
-        slope_min: smallest slope of a law over the signals of the run.
+        slope_min: smallest slope of a law over the signals that it is for.
 
     Raises:
         ExcitationError: the run does not show hysteresis.
@@ -131,7 +131,7 @@ def identify(
         whole = whole or problem.fit(train)
         if not whole.candidate.own and whole.candidate.slopes:
             fading.append(whole)
-        slope = law_shape.slope_min(whole.law, *run.reach).min()
+        slope = law_shape.slope_min(whole.law, *run.in_use).min()
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return
@@ -175,7 +175,9 @@ def identify(
             for left_out in (test & half, test & ~half):
                 if left_out.any():
                     held_out[left_out] = problem.fit(usable & ~left_out, fitted).residual[left_out]
-        fitted = problem.fit(usable, fitted)
+        whole = problem.fit(usable, fitted)
+        if law_shape.slope_min(whole.law, *run.in_use).min() >= slope_min:
+            fitted = whole
     return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused, quiet)
 
 

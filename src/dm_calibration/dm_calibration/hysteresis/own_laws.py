@@ -182,7 +182,7 @@ class OwnLaws:
 
     def _share_kept(self, law: HysteresisModel) -> Floats:
         """(N,) share of its hysteresis that each law may keep to be inverted safely: 1 and more = all of it."""
-        return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.reach), 0.999)))
+        return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.in_use), 0.999)))
 
     def _features(self, slope: Floats) -> Floats:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""

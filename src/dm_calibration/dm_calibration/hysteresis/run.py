@@ -36,6 +36,7 @@ class Run:
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
         degaussed: (M,) before which maps, at mid range, the mirror was degaussed in its course; None = none.
         rest: signal of mid range, where a degauss ends.
+        limits: lowest and highest signal that a law of the run is for; None = those of the run.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -49,6 +50,7 @@ class Run:
     segment: NDArray[np.int64] | None = None
     degaussed: NDArray[np.bool_] | None = None
     rest: float = 0.0
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if (np.diff(self.time) < 0.0).any():
@@ -80,6 +82,16 @@ class Run:
         """Lowest and highest signal of the actuators that moved; one without a channel stands elsewhere."""
         moved = self.signals[:, np.ptp(self.signals, axis=0) > 0.0]
         return float(moved.min()), float(moved.max())
+
+    @property
+    def in_use(self) -> tuple[float, float]:
+        """Lowest and highest signal at which a law of the run may be inverted: its reach, and the limits.
+
+        Where neighbours may not differ much, short runs come nowhere near an end of the range, and polynomials may
+        fall there.
+        """
+        low, high = self.limits or self.reach
+        return min(low, self.reach[0]), max(high, self.reach[1])
 
     def follow(self, law: HysteresisModel) -> Floats:
         """(M, N) effective signals."""

@@ -122,7 +122,7 @@ class MapListener:
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
-        doubts = self._updates.doubts
+        doubts = [*self._updates.doubts, *self._updates.widened]
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
         kept = self._updates.in_use

@@ -97,6 +97,15 @@ class RecalibrationManager:
             doubts.append(f"{kept.drift.given_up}.")
         return doubts
 
+    @property
+    def widened(self) -> list[str]:
+        """A sentence where bounds are wider by maps that disagree, but these are too few for a doubt."""
+        surprising = self.in_use.drift.surprising if self.in_use is not None else 0
+        if not surprising or self.mirror_changed:
+            return []
+        last = "map disagrees" if surprising == 1 else f"{surprising} maps disagree"
+        return [f"The last {last} with this calibration: bounds are wider until one agrees."]
+
     def begin(self, calibration: Calibration | None) -> str:
         """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
 

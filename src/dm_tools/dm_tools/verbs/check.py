@@ -101,8 +101,9 @@ def check(
     if not (forget or without or kept(promised, response.max_zernike)):
         next_step("one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate")
         raise typer.Exit(1)
-    if without and not dry_run:
-        next_step("ask for the shape again: the command that stands counts on all actuators; ./dm status has the range")
+    if without:
+        again = "ask for the shape again: the command that stands counts on all actuators; ./dm status has the range"
+        next_step("the same without --dry-run goes on so; nothing is changed yet" if dry_run else again)
         return
     if lost and not forget:
         next_step("./dm degauss: then focus_controller knows the history too")

@@ -108,6 +108,9 @@ def report(
     if store is None:
         calibration = calibration or str(file_in_use or "")
         store = folder_with(calibration, STORES if file_in_use is None else (file_in_use.parent, *STORES))
+        if not (calibration or any(store.expanduser().glob("*.h5"))):
+            folders = " or ".join(str(folder) for folder in STORES)
+            raise ValueError(f"no calibration in {folders}: calibrate first (./dm calibrate), or name its --store")
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:
         values = JUDGED_BY  # another mirror's limits are none of this one

@@ -124,7 +124,8 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
         return "not known"
     farthest = max(capabilities.curvature_min, capabilities.curvature_max, key=abs)
     farthest = math.trunc(1e4 * farthest) / 1e4  # as the range is told
-    return f"{two_fold(capabilities.error_bound, calibration, farthest)}, at {farthest:+.4f} 1/m"
+    known = min(calibration.instrument_error, calibration.scale_error) > 0.0
+    return two_fold(capabilities.error_bound, calibration, farthest) + (f", at {farthest:+.4f} 1/m" if known else "")
 
 
 def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
