@@ -27,7 +27,7 @@ from typer.testing import CliRunner
 
 from console_stand_in import EXECUTING, FakeNode, Goal
 from dm_client import DeformableMirrorError
-from dm_common.errors import ErrorCode
+from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
@@ -438,9 +438,19 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
 
 def test_of_another_bench_the_wiring_comes_first() -> None:
     """As docs/my-own-bench.md has it: four minutes of calibration on wrong wiring are lost."""
-    check = parsed("calibrate", *first_command(False, Path("my_bench.yaml")).split()[1:])
-    assert check["plan"] == "poke-check" and check["config"] == Path("my_bench.yaml") and check["write"] is not None
-    assert first_command(True, Path("my_bench.yaml")) == "focus 0.02" and first_command(False, None) == "calibrate"
+    none, able, file = Capabilities(), Capabilities(calibration_id="c1"), Path("my_bench.yaml")
+    check = parsed("calibrate", *first_command(none, file).split()[1:])
+    assert check["plan"] == "poke-check" and check["config"] == file and check["write"] is not None
+    assert first_command(able, file) == "focus 0.02" and first_command(none, None) == "calibrate"
+    # As ./dm status has it then.
+    able.message = f"-0.05 to +0.05 1/m; {HISTORY_UNKNOWN}restarted"
+    assert first_command(able, file) == "degauss"
+    refused = Capabilities(error_code=ErrorCode.CALIBRATION_UNREADABLE)
+    used = Calibration()
+    used.hysteresis.play_radius = [0.0]
+    active = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE)
+    assert first_command(refused, file) == "calibrate"
+    assert verb_status._next([], "", active, used, None, refused) == "./dm calibrate"
 
 
 @pytest.mark.parametrize(

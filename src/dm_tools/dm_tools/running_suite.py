@@ -81,6 +81,12 @@ def unknown_history(capabilities: Any) -> str:
     return next((text.removeprefix(HISTORY_UNKNOWN) for text in said if text.startswith(HISTORY_UNKNOWN)), "")
 
 
+def calibration_refused(capabilities: Any) -> bool:
+    """Whether the focus controller does not use the calibration that is published."""
+    refused = (ErrorCode.CALIBRATION_MISMATCH, ErrorCode.CALIBRATION_UNREADABLE)
+    return capabilities is not None and capabilities.error_code in refused
+
+
 def ago(seconds: float) -> str:
     """A time that has passed, in the unit that fits it."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):

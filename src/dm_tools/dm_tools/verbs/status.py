@@ -13,6 +13,7 @@ from dm_tools.running_suite import (
     REPORT_S,
     SettledShape,
     ago,
+    calibration_refused,
     hear_health,
     holder,
     nodes_of_suite,
@@ -137,7 +138,7 @@ def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any,
         return str(capabilities.message)
     if by:
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
-    if calibration is None or not calibration.hysteresis.play_radius:
+    if calibration is None or not calibration.hysteresis.play_radius or calibration_refused(capabilities):
         return "./dm calibrate"
     if unknown_history(capabilities):
         return "./dm degauss: the actuators' history is not known, and the promise is wider for it"

@@ -17,6 +17,7 @@ import typer
 
 from dm_bringup.suite import Config, load_config
 from dm_tools.output import checked_namespace, console, next_step
+from dm_tools.running_suite import calibration_refused, unknown_history
 
 #: A suite that is not ready after this is said to be late, s.
 LATE_S = 30.0
@@ -151,8 +152,7 @@ def lacks(messages: Mapping[str, Any]) -> str:
         return str(capabilities.message)
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
         return "calibration and focus_controller have not said yet what the mirror can do"
-    refused = capabilities.error_code in (ErrorCode.CALIBRATION_MISMATCH, ErrorCode.CALIBRATION_UNREADABLE)
-    if messages["calibration"].id and not (capabilities.calibration_id or refused):
+    if messages["calibration"].id and not (capabilities.calibration_id or calibration_refused(capabilities)):
         return "focus_controller has not taken the calibration yet"
     return ""
 
@@ -170,18 +170,22 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
                 console.print(f"not ready after {LATE_S:.0f} s: {lacking}; ./dm doctor says more")
             yield
         capabilities, mirror = client.capabilities, client.mirror_info
+    in_use = f"calibration {capabilities.calibration_id}" if capabilities.calibration_id else "not calibrated yet"
+    if calibration_refused(capabilities):
+        in_use = f"its calibration is not used: {capabilities.message}"
     console.print(
-        f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, "
-        + (f"calibration {capabilities.calibration_id}" if capabilities.calibration_id else "not calibrated yet")
+        f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, {in_use}"
     )
-    first = first_command(bool(capabilities.calibration_id), file)
+    first = first_command(capabilities, file)
     next_step(f"in another terminal: ./dm {first}{option}; ./dm status{option} says how things are")
 
 
-def first_command(calibrated: bool, file: Path | None) -> str:
+def first_command(capabilities: Any, file: Path | None) -> str:
     """What to do first with a suite that `file` configures; None = the virtual bench that ships, whose wiring holds."""
-    if calibrated:
-        return "focus 0.02"
+    if capabilities.calibration_id:
+        return "degauss" if unknown_history(capabilities) else "focus 0.02"
+    if calibration_refused(capabilities):
+        return "calibrate"
     return f"calibrate --plan poke-check --config {file} --write found.yaml" if file is not None else "calibrate"
 
 
