@@ -119,7 +119,7 @@ def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     reach = iter([9.0, 5.0, 4.9, 4.95, 4.9])
     monkeypatch.setattr(
         "dm_calibration.procedure.forecast.fit_hysteresis",
-        lambda _maps: SimpleNamespace(held_out_max_zernike=1e-9 * next(reach)),
+        lambda _maps, limits: SimpleNamespace(held_out_max_zernike=1e-9 * next(reach)),
     )
     enough = GoodEnough(1e-9)
     outcome: Any = SimpleNamespace(maps=lambda: None)

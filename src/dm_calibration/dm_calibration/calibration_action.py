@@ -127,7 +127,11 @@ class CalibrateAction:
     def _run_kept(self, runs: UnfinishedRuns) -> None:
         """Begin or resume a run, keep each map as it comes, conclude; fills the result, also after a failure."""
         result, run = self._result, self._opened(runs)
-        enough = GoodEnough(self._goal.until, lambda reached: self._report_reached(reached, len(run.outcome.records)))
+        enough = GoodEnough(
+            self._goal.until,
+            lambda reached: self._report_reached(reached, len(run.outcome.records)),
+            self._mirror.limits,
+        )
         procedure = self._procedure(run, enough)
         try:
             if run.storing is None:  # else all is measured, and what may be stored already must stay as it is

@@ -82,7 +82,7 @@ class Identification:
         names = ", ".join(str(number + 1) for number in np.flatnonzero(self.fit.changed))
         return (
             f"Hysteresis: as found, the law of actuator{'s' if self.fit.changed.sum() > 1 else ''} {names} could not "
-            "be inverted safely; it was changed as little as that takes."
+            "be inverted safely; it was changed so that it can."
         )
 
 

@@ -16,6 +16,7 @@ from dm_calibration.procedure.plan import Plan, Step, StepKind
 from dm_common import Floats
 from dm_common.figures import in_nanometres, rounded, told_from
 from dm_common.geometry import pitch
+from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points
@@ -166,18 +167,21 @@ class GoodEnough:
     Args:
         until: m, as `HysteresisFit.held_out_max_zernike`.
         report: called with what each part of the run reached, m.
+        limits: of the signals, as for :func:`~dm_calibration.hysteresis.hysteresis_fit.fit_hysteresis`.
 
     Attributes:
         reached: m, after each part.
     """
 
-    def __init__(self, until: float, report: Callable[[float], None] = lambda reached: None) -> None:
-        self._until, self._report = until, report
+    def __init__(
+        self, until: float, report: Callable[[float], None] = lambda reached: None, limits: Limits | None = None
+    ) -> None:
+        self._until, self._report, self._limits = until, report, limits
         self.reached: list[float] = []
 
     def __call__(self, outcome: Outcome) -> bool:
         try:
-            found = fit_hysteresis(outcome.maps()).held_out_max_zernike
+            found = fit_hysteresis(outcome.maps(), limits=self._limits).held_out_max_zernike
         except TooFewMapsError:
             return False
         self.reached.append(found)

@@ -100,8 +100,8 @@ class RecalibrationManager:
     @property
     def widened(self) -> list[str]:
         """A sentence where bounds are wider by maps that disagree, but these are too few for a doubt."""
-        surprising = self.in_use.drift.surprising if self.in_use is not None else 0
-        if not surprising or self.mirror_changed:
+        surprising = 0 if (kept := self.in_use) is None else kept.drift.surprising
+        if not 0 < surprising < self._options().surprises_max:
             return []
         last = "map disagrees" if surprising == 1 else f"{surprising} maps disagree"
         return [f"The last {last} with this calibration: bounds are wider until one agrees."]

@@ -151,7 +151,7 @@ def run_goal(
         deadline = time.monotonic() + seconds
         while not condition():
             if gone() or time.monotonic() > deadline:
-                raise ServiceCallError(f"{name}: {missing} within {seconds:g} s{hint}")
+                raise ServiceCallError(f"{name}: {missing}{f' within {seconds:g} s' * math.isfinite(seconds)}{hint}")
             time.sleep(0.005)
 
     wait(lambda: stop() or client.server_is_ready(), answer_s, "no such action", "; is its node running?")

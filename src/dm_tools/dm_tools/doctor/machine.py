@@ -158,14 +158,17 @@ def running_nodes(namespace: str = "") -> Finding:
             )
         if count and (skew := _skew(client)) is not None:
             return skew
-        if "pdm_driver" in count and (reason := link_lost(client)):
-            return Finding(
-                f"{', '.join(count)}, {place}{LINK_LOST}{reason}",
-                "switch the unit on and check its cable; ./dm doctor --config FILE looks for it",
-            )
-    if lacking := [f"{name} ({effect})" for name, effect in NEEDED.items() if count and name not in count]:
+        reason = link_lost(client) if "pdm_driver" in count else ""
+    lacking = ", ".join(f"{name} ({effect})" for name, effect in NEEDED.items() if count and name not in count)
+    lacking = f"; not running: {lacking}" if lacking else ""
+    if reason:
         return Finding(
-            f"{', '.join(count)}, {place}; not running: {', '.join(lacking)}",
+            f"{', '.join(count)}, {place}{LINK_LOST}{reason}{lacking}",
+            "switch the unit on and check its cable; ./dm doctor --config FILE looks for it",
+        )
+    if lacking:
+        return Finding(
+            f"{', '.join(count)}, {place}{lacking}",
             "end ./dm up with Ctrl-C and start it again",
             note=True,
         )

@@ -80,7 +80,9 @@ class Recorder:
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
         self._subscribed: set[str] = set()
         self._clients: dict[str, AsyncParameterClient] = {}
-        self._asked: dict[bytes, float] = {}  # by what publishes a node's parameter events: when it is asked again
+        # By what publishes a node's parameter events: when it is asked again, and when it was first seen, ns.
+        self._asked: dict[bytes, float] = {}
+        self._seen: dict[bytes, int] = {}
         self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
         # The events executor cannot hand over messages as they came (it fails on raw subscriptions).
@@ -183,6 +185,7 @@ class Recorder:
             path = f"{publisher.node_namespace.rstrip('/')}/{name}"
             if name not in NAMES or now < self._asked.get(node, now) or not path.startswith(self._namespace):
                 continue
+            self._seen.setdefault(node, time.time_ns())
             if path not in self._clients:
                 self._clients[path] = AsyncParameterClient(self._node, path)
             if not self._clients[path].services_are_ready():
@@ -198,7 +201,7 @@ class Recorder:
         """
         names = list(listed.result().result.names)
         event = ParameterEvent(node=path)
-        begun = time.time_ns()  # what changes from now on is told later, so the newer value stands
+        begun = self._seen[node]  # what changes from then on is told later, so the newer value stands
 
         def fetch_next() -> None:
             if names:
@@ -210,6 +213,7 @@ class Recorder:
                 self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, serialize_message(event), begun))
 
         def keep(name: str, answer: Sequence[Any]) -> None:
+            self._asked[node] = time.monotonic() + ASK_AGAIN_S
             event.new_parameters += [Parameter(name=name, value=value) for value in answer]
             fetch_next()
 

@@ -25,6 +25,9 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
         if signed.is_file() and governance.is_file() and _plain(governance) not in _plain(signed):
             cure = "remove it, and create_keystore signs it anew"
             found.append(f"{signed}: holds another governance than {governance.name}: {cure}")
+    signed_one = governance.with_suffix(".p7s")
+    if not signed_one.is_file() and any(governance.parent.rglob("permissions.xml")):
+        found.append(f"{signed_one}: missing; create_keystore signs it")
     expected = {profile.path(enclave).lstrip("/") for enclave in enclaves}
     for path in sorted((folder / "enclaves").rglob("permissions.xml")):
         place = path.parent.relative_to(folder / "enclaves").as_posix()

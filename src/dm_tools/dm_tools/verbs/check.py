@@ -103,7 +103,7 @@ def check(
         raise typer.Exit(1)
     if without:
         again = "ask for the shape again: the command that stands counts on all actuators; ./dm status has the range"
-        next_step("the same without --dry-run goes on so; nothing is changed yet" if dry_run else again)
+        next_step("the same command, but for --dry-run, goes on so; nothing is changed yet" if dry_run else again)
         return
     if lost and not forget:
         next_step("./dm degauss: then focus_controller knows the history too")
