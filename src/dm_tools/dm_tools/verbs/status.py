@@ -4,8 +4,6 @@ import math
 import time
 from typing import Any
 
-from rich.markup import escape
-
 from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
 from dm_common.optics.conic import range_text
@@ -118,7 +116,7 @@ def _promise(capabilities: Any) -> str:
     return (
         f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
         f"from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move says its own"
-        f"{f'; [yellow]{escape(remarks)}[/]' if remarks else ''}"
+        f"{f'; [yellow]{remarks}[/]' if remarks else ''}"
     )
 
 
