@@ -61,7 +61,8 @@ ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
 #: Rounds of the three solutions in turn, of runs of so many maps: with 6 slow creep is a third less true and held-out
-#: errors up to four times as large, with 60 hardly better. Of shorter runs as many more; of 100 maps 60 are best.
+#: errors up to four times as large, with 60 hardly better. Of shorter runs as many more: of 100 maps 60 leave up to a
+#: quarter less than 20, on some mirrors a tenth more.
 ROUNDS, ROUNDS_MAPS = 20, 300
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
