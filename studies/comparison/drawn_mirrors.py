@@ -12,7 +12,13 @@ from dm_simulation.mirror.plate import PlateConfig
 from studies.comparison.simulated_bench import SimulationConfig
 
 #: Laws to draw from, and how often each comes.
-LAWS = {"drawn_preisach": 0.45, "drawn_mixed": 0.2, "drawn_bouc_wen": 0.15, "drawn_jiles_atherton": 0.2}
+LAWS = {
+    "drawn_preisach": 0.3,
+    "drawn_unlike": 0.15,
+    "drawn_mixed": 0.2,
+    "drawn_bouc_wen": 0.15,
+    "drawn_jiles_atherton": 0.2,
+}
 #: Largest difference between neighbours as shipped, see pdm_driver's `limits.neighbour_difference`.
 SHIPPED_NEIGHBOUR_DIFFERENCE = 1.0
 #: Creep of few elements: first and last time constant, s, a decade apart.

@@ -12,10 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate, CandidateProblem
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
+from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run
 from dm_common import Floats
@@ -30,6 +31,7 @@ pytestmark = pytest.mark.slow
 LINEAR, PLAIN = CANDIDATES[0], PiezoConfig()
 #: Tried with the linear one alone where not the choice among laws is tested.
 PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii")
+OWN = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
 
 
 def simulated_run(
@@ -93,6 +95,25 @@ def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str,
     assert slope_min(found.fit.law).min() > 0.1
 
 
+def test_a_law_is_chosen_by_coefficients_whatever_the_noise_of_patterns_beyond_them() -> None:
+    """Noise of 480 patterns, all in units of what a common law leaves, hid that own laws leave a ninth of it."""
+    run, check = simulated_run("drawn_preisach")
+    shown = run.responses.values
+    noise = 1e-7 * np.random.default_rng(12).standard_normal((len(shown), 480))
+    noisy = replace(run, responses=replace(run.responses, values=np.hstack((shown, noise))))
+    assert identify(noisy, check, [LINEAR, PREISACH, OWN]).fit.candidate is OWN
+
+
+@pytest.mark.parametrize(("law", "least", "most"), [("drawn_preisach", 0.05, 0.2), ("drawn_unlike", 0.4, 0.8)])
+def test_how_far_actuators_differ_is_found(law: str, least: float, most: float) -> None:
+    run, check = simulated_run(law)
+    scatter = np.full(run.responses.values.shape[1], 1e-9)
+    laws = OwnLaws(run, OWN, CandidateProblem(run, PREISACH, scatter).fit(~check).law, scatter, 0.1)
+    laws.fit(~check)
+    assert laws.spread is not None
+    assert least <= laws.spread <= most
+
+
 def test_a_richer_law_that_leaves_hardly_less_counts_as_the_simpler(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its folds tell nothing more, and it comes after the simpler one, from which own laws begin."""
     begun = list[str]()
@@ -102,9 +123,8 @@ def test_a_richer_law_that_leaves_hardly_less_counts_as_the_simpler(monkeypatch:
         return _begun(run, candidate, starts, *rest)
 
     monkeypatch.setattr("dm_calibration.hysteresis.identify._begun", seen)
-    own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
     richer = replace(PLAYS, name="one power more", powers=PLAYS.powers + 1)
-    found = identify(*simulated_run("prandtl_ishlinskii"), [LINEAR, PLAYS, richer, own])
+    found = identify(*simulated_run("prandtl_ishlinskii"), [LINEAR, PLAYS, richer, OWN])
     assert found.scores[richer.name] == found.scores[PLAYS.name]
     assert begun == [PLAYS.name, richer.name]
 
@@ -246,7 +266,7 @@ def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest
 
     monkeypatch.setattr("dm_calibration.hysteresis.identify.OwnLaws", Own)
     starts: Any = [SimpleNamespace(law=left) for left in (1.0, 0.99, 0.5)]
-    run: Any = None
+    run: Any = SimpleNamespace(responses=SimpleNamespace(coefficients=2))
 
     def order(candidate: Candidate) -> list[Any]:
         begun: Any = _begun(run, candidate, starts, np.ones(2), np.ones(4, dtype=bool), 0.1)

@@ -1,4 +1,4 @@
-"""Duhem operators of each actuator, found from how the common one's values differ, and weights of features."""
+"""Duhem operators of each actuator, found from how the common one's values differ."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from dm_calibration.hysteresis.features import (
     fading_features,
     own_slopes,
     padded_slope,
-    weights_of,
 )
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.hysteresis.own_laws import OwnLaws
@@ -44,20 +43,6 @@ def test_nothing_is_said_of_an_operator_without_weight() -> None:
     common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
     weight, changes = np.full(ACTUATORS, 1e-3), np.full((common[0].size, ACTUATORS), 0.1)
     assert own_slopes(common, weight, changes) == pytest.approx(common)
-
-
-def test_weights_are_those_of_the_normal_equations() -> None:
-    rng = np.random.default_rng(3)
-    features, left, gains = (rng.standard_normal(shape) for shape in ((40, 3, ACTUATORS), (40, 6), (ACTUATORS, 6)))
-    own, common = 100.0, 100.0 / (ACTUATORS + 0.01)
-    root = np.array([[1.0, 0.0, 0.0], [0.3, 0.5, 0.0], [0.0, 0.1, 2.0]])
-    between = own * np.eye(ACTUATORS) - common
-    columns = np.einsum("mfn,nd->mdnf", features, gains).reshape(40 * 6, -1)
-    normal = columns.T @ columns + np.kron(between, np.linalg.inv(root @ root.T))
-    expected = np.linalg.solve(normal, columns.T @ left.ravel()).reshape(ACTUATORS, 3).T
-    for begin in (np.zeros_like(expected), expected + 1.0):
-        found = weights_of(features, left, gains, root, (own, common), begin)
-        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("own", [True, False])

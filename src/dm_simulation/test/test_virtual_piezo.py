@@ -156,7 +156,7 @@ def test_unknown_laws_and_impossible_loops_are_refused() -> None:
         Hysteresis("prandtl_ishlinskii", 0.9, 1)
 
 
-DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_jiles_atherton")
+DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_unlike", "drawn_jiles_atherton")
 
 
 @pytest.mark.parametrize("law", DRAWN_LAWS)
@@ -169,6 +169,16 @@ def test_drawn_laws_follow_from_their_seed_and_differ_between_actuators_and_seed
     np.testing.assert_array_equal(loop(1), first)
     assert np.abs(loop(2) - first).max() > 1e-3
     assert np.ptp(first[2:], axis=1).min() > 1e-4  # each actuator is another
+
+
+def test_a_drawn_loop_is_no_wider_than_its_density_can_have() -> None:
+    law = Hysteresis("drawn_unlike", 0.2, 37, np.random.default_rng(3))
+    signals = np.concatenate([np.linspace(-1, 1, 41), np.linspace(1, -1, 41)] * 2)
+    moved = np.array([law.move(np.full(37, u)) for u in signals])[-82:]
+    assert np.ptp(moved, axis=0) == pytest.approx(2.0, abs=0.02)
+    opening = (moved[41:][::-1] - moved[:41]).max(axis=0) / 2.0
+    assert opening.max() == pytest.approx(0.2, abs=0.01)
+    assert 0.05 < opening.min() < 0.19
 
 
 def test_a_drawn_density_is_one_of_relays_and_each_actuator_s_own() -> None:

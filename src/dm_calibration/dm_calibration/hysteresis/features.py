@@ -1,10 +1,8 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
 from collections.abc import Iterator
-from inspect import signature
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, cg
 
 from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator, FadingHysteresis
@@ -16,10 +14,6 @@ EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
-#: Residual of the solved weights, relative: effective signals are within 1e-6 then.
-SOLVED = 1e-6
-#: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
-_RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Patterns that are kept of the prior.
 PATTERNS = 60
 #: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
@@ -214,42 +208,3 @@ def follow(
         state = law.advance(law.move(state, shape, float(start)), float(when))
         result[row] = law.effective(state)
     return result, state
-
-
-def weights_of(
-    features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float], begin: Floats
-) -> Floats:
-    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
-
-    Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
-    own I - common 1 1'. Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
-
-    Args:
-        between: own, common.
-        begin: (F, N) weights to begin with.
-    """
-    own, common = between
-    count, actuators = features.shape[1:]
-    # Of unknowns u with w = root u, whose prior is 1.
-    columns = np.ascontiguousarray(features.transpose(2, 0, 1)) @ root
-    rows = np.ascontiguousarray(columns.transpose(0, 2, 1))
-    seen = gains @ gains.T
-    alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
-    together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
-
-    def evidence(flat: Floats) -> Floats:
-        unknown = flat.reshape(actuators, count, 1)
-        shown = (rows @ (seen @ (columns @ unknown)[..., 0])[..., None])[..., 0]
-        return np.asarray(shown + own * unknown[..., 0] - common * unknown[..., 0].sum(axis=0)).ravel()
-
-    def nearly_solved(flat: Floats) -> Floats:
-        solved = (alone @ flat.reshape(actuators, count, 1))[..., 0]
-        return np.asarray(solved + alone @ (together @ solved.sum(axis=0))).ravel()
-
-    right = (rows @ (gains @ left.T)[..., None]).ravel()
-    shape = (right.size, right.size)
-    preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
-    tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
-    first = np.linalg.solve(root, begin).T.ravel()
-    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, first, M=preconditioner, **tolerance)
-    return np.asarray(root @ unknown.reshape(actuators, count).T)

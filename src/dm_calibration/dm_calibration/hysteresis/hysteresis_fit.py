@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import largest_of
+from dm_calibration.hysteresis.actuator_weights import weights_of
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
-from dm_calibration.hysteresis.features import weights_of
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, basis_of, run_of, without

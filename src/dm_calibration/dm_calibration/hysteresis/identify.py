@@ -123,7 +123,7 @@ def identify(
     refused: dict[str, str] = {}
 
     def size(residual: Floats) -> float:
-        return float(np.sqrt(np.mean(np.square(residual[train] / scatter))))
+        return _size(run, residual[train] / scatter)
 
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
@@ -192,11 +192,16 @@ def _begun(
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
         made = list(fitted)
-        left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
+        left = [_size(run, fit.residual[keep] / scatter) for _, fit in made]
         for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
             yield made[number]
     else:
         yield from fitted
+
+
+def _size(run: Run, residual: Floats) -> float:
+    """Root mean square of the coefficients of `residual` (M, D): beside them the noise of maps hides errors of laws."""
+    return float(np.sqrt(np.mean(np.square(residual[:, : run.responses.coefficients]))))
 
 
 def _contains(richer: Candidate, simpler: Candidate) -> bool:

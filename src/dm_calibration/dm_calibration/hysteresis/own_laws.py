@@ -21,6 +21,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from dm_calibration.hysteresis.actuator_weights import SPREADS, alike, likeliest_spread, weights_of
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
@@ -33,7 +34,6 @@ from dm_calibration.hysteresis.features import (
     play_values,
     spectrum_prior,
     weight_of,
-    weights_of,
 )
 from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
@@ -64,9 +64,6 @@ CREEP_SLOPE = 0.3
 #: errors up to four times as large, with 60 hardly better. Of shorter runs as many more: of 100 maps 60 leave up to a
 #: quarter less than 20, on some mirrors a tenth more.
 ROUNDS, ROUNDS_MAPS = 20, 300
-#: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
-#: times of it errors change by less than a tenth.
-SPREAD = 0.1
 #: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps, none of which
 #: leaves less than LEAST of it. Where more than a tenth would have to go and its Duhem operator is its own, it takes
 #: the common one first. One of many may fall where hardly a map shows it.
@@ -99,6 +96,9 @@ class OwnLaws:
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
         slope_min: of each law, see SHRUNK.
+
+    Attributes:
+        spread: of the patterns between actuators; None = before half of the first rounds, whose maps tell it.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class OwnLaws:
         first = 1 + self._basis.shape[1]
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         count = signals.shape[1]
-        self._between = _alike(count, SPREAD)
+        self.spread: float | None = None
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)
@@ -137,7 +137,7 @@ class OwnLaws:
         prior = block_diag(prior_of_creep, lag, CREEP_SLOPE**2)
         self._creep_root = np.asarray(np.linalg.cholesky(prior), dtype=np.float64)
         self._signal_states = self.run.creep_states(signals)
-        self._creep_between = _alike(count, SPECTRUM_SPREAD)
+        self._creep_between = alike(count, SPECTRUM_SPREAD)
 
     def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
         """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
@@ -214,7 +214,8 @@ class OwnLaws:
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, root)
+            ask = self.spread is None and number == self._rounds_needed // 2
+            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, root, ask)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -269,11 +270,14 @@ class OwnLaws:
         return self.run.responses.scatter(size)
 
     def _patterns(
-        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats
+        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats, ask: bool
     ) -> Floats:
-        """(F, N): the signal itself counts 1, the others follow their prior."""
-        left = measured - crept[:, 0] @ gains
-        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between, begin[1:])
+        """(F, N): the signal itself counts 1, the others follow their prior. `ask` for how far actuators differ."""
+        left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
+        if ask:
+            self.spread = likeliest_spread(features, left, gains, root, begin[1:])
+        between = alike(features.shape[2], self.spread or SPREADS[1])
+        solved = weights_of(features, left, gains, root, between, begin[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
@@ -291,9 +295,3 @@ class OwnLaws:
         expected[ELEMENTS] = self._creep
         begin = creep - expected
         return expected + weights_of(elements, left, gains, self._creep_root, self._creep_between, begin)
-
-
-def _alike(actuators: int, spread: float) -> tuple[float, float]:
-    """What :func:`weights_of` takes where actuators share a common part and differ by `spread` of it."""
-    own = spread**-2.0
-    return own, own / (actuators + spread**2)

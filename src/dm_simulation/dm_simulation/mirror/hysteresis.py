@@ -19,6 +19,10 @@ from dm_simulation.mirror.zernike import Array
 BOUC_WEN_STEP, JILES_ATHERTON_STEP = 0.02, 0.005
 #: Points of a sweep and cycles from which the opening of a loop is taken.
 SWEEP_POINTS, SWEEP_CYCLES = 61, 2
+#: Of drawn Bouc-Wen laws: order, `onward` of rising and of falling moves, `back`.
+BOUC_WEN_RANGES = (0.8, 3.0), (1.5, 3.0), (1.5, 3.0), (0.3, 1.2)
+#: A drawn loop that is wider than its law can have has this share of what it can.
+WIDEST = 0.8
 
 
 class HysteresisLaw(Protocol):
@@ -126,7 +130,7 @@ def _drawn_preisach(count: int, rng: np.random.Generator) -> HysteresisLaw:
 
 
 def _drawn_bouc_wen(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    return BoucWenHysteresis(count, *_drawn_constants(count, rng, (0.8, 3.0), (1.5, 3.0), (1.5, 3.0), (0.3, 1.2)))
+    return BoucWenHysteresis(count, *_drawn_constants(count, rng, *BOUC_WEN_RANGES))
 
 
 def _drawn_jiles_atherton(count: int, rng: np.random.Generator) -> HysteresisLaw:
@@ -136,11 +140,24 @@ def _drawn_jiles_atherton(count: int, rng: np.random.Generator) -> HysteresisLaw
 
 
 def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    """Both in parts that differ between the actuators, each law alone with a loop of the same opening."""
+    """Preisach's and Bouc-Wen's law in parts that differ between the actuators."""
     share = np.clip(rng.uniform(0.2, 0.8) + 0.1 * rng.standard_normal(count), 0.0, 1.0)
+    return _in_parts(share, _drawn_preisach(count, rng), _drawn_bouc_wen(count, rng))
+
+
+def _drawn_unlike(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    """Actuators with no more in common than those of other mirrors: Preisach, on every other one with Bouc-Wen."""
+    densities = [drawn_density(1, rng) for _ in range(count)]
+    preisach = PreisachOperator(count, lambda v, r: np.concatenate([density(v, r) for density in densities]))
+    bouc_wen = BoucWenHysteresis(count, *(rng.uniform(*bounds, count) for bounds in BOUC_WEN_RANGES))
+    return _in_parts(1.0 - rng.uniform(0.2, 0.5, count) * (rng.random(count) < 0.5), preisach, bouc_wen)
+
+
+def _in_parts(share: Array, first: HysteresisLaw, second: HysteresisLaw) -> HysteresisLaw:
+    """`share` (N,) of the first law and the rest of the second, each alone with a loop of the same opening."""
     parts = []
-    for law, part in ((_drawn_preisach(count, rng), share), (_drawn_bouc_wen(count, rng), 1 - share)):
-        rising, falling = _full_loop(law, count)
+    for law, part in ((first, share), (second, 1 - share)):
+        rising, falling = _full_loop(law, len(share))
         parts.append((part / np.max(falling - rising, axis=0), law))
     return MixedHysteresis(tuple(parts))
 
@@ -161,6 +178,7 @@ LAWS: dict[str, Callable[[int, np.random.Generator], HysteresisLaw]] = {
     "drawn_preisach": _drawn_preisach,
     "drawn_bouc_wen": _drawn_bouc_wen,
     "drawn_mixed": _drawn_mixed,
+    "drawn_unlike": _drawn_unlike,
     "drawn_jiles_atherton": _drawn_jiles_atherton,
 }
 
@@ -208,6 +226,8 @@ def _weight_and_scale(name: str, law: HysteresisLaw, fraction: Array) -> tuple[A
     rising, falling = _full_loop(law, len(fraction))
     opening, span = np.max(falling - rising, axis=0), rising[-1] - rising[0]
     # fraction = weight * opening / (2 + weight * span)
+    if name.startswith("drawn"):
+        fraction = np.where(span > 0, np.minimum(fraction, WIDEST * opening / np.maximum(span, 1e-9)), fraction)
     free = opening - fraction * span
     if np.any(free <= 0):
         raise ValueError(f"piezo.hysteresis = {fraction.max():g}: {name} reaches at most {np.min(opening / span):.2f}")

@@ -1,0 +1,95 @@
+"""Weights of features of each actuator, drawn towards those that all actuators share.
+
+Of each feature the weights are a common one and what an actuator adds to it. Both are normal; how much actuators
+differ, relative to the common weights, is a number that the maps tell.
+"""
+
+from inspect import signature
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import LinearOperator, cg
+
+from dm_common import Floats
+
+#: Residual of the solved weights, relative: effective signals are within 1e-6 then.
+SOLVED = 1e-6
+#: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
+_RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
+#: Standard deviations between actuators, relative to that of the common weights, of which the likeliest is taken: 0.1
+#: or 0.2 on mirrors whose densities of relays are like each other's to 15 %, up to 0.8 where each is of its own.
+SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
+#: How many actuators, spread over the mirror, are asked: the time that this takes grows with the third power.
+ASKED = 40
+
+
+def alike(actuators: int, spread: float) -> tuple[float, float]:
+    """What :func:`weights_of` takes where actuators share a common part and differ by `spread` of it."""
+    own = spread**-2.0
+    return own, own / (actuators + spread**2)
+
+
+def weights_of(
+    features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float], begin: Floats
+) -> Floats:
+    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
+
+    Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
+    own I - common 1 1'. Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
+
+    Args:
+        between: own, common.
+        begin: (F, N) weights to begin with.
+    """
+    own, common = between
+    count, actuators = features.shape[1:]
+    # Of unknowns u with w = root u, whose prior is 1.
+    columns = np.ascontiguousarray(features.transpose(2, 0, 1)) @ root
+    rows = np.ascontiguousarray(columns.transpose(0, 2, 1))
+    seen = gains @ gains.T
+    alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
+    together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
+
+    def evidence(flat: Floats) -> Floats:
+        unknown = flat.reshape(actuators, count, 1)
+        shown = (rows @ (seen @ (columns @ unknown)[..., 0])[..., None])[..., 0]
+        return np.asarray(shown + own * unknown[..., 0] - common * unknown[..., 0].sum(axis=0)).ravel()
+
+    def nearly_solved(flat: Floats) -> Floats:
+        solved = (alone @ flat.reshape(actuators, count, 1))[..., 0]
+        return np.asarray(solved + alone @ (together @ solved.sum(axis=0))).ravel()
+
+    right = (rows @ (gains @ left.T)[..., None]).ravel()
+    shape = (right.size, right.size)
+    preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
+    tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
+    first = np.linalg.solve(root, begin).T.ravel()
+    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, first, M=preconditioner, **tolerance)
+    return np.asarray(root @ unknown.reshape(actuators, count).T)
+
+
+def likeliest_spread(features: Floats, left: Floats, gains: Floats, root: Floats, weights: Floats) -> float:
+    """Which of SPREADS makes `left` likeliest, whatever the weights are ("evidence" in [39]).
+
+    Args:
+        features, left, gains, root: as :func:`weights_of`; `left` in standard deviations.
+        weights: (F, N) so far: those of actuators that are not asked stay.
+    """
+    asked = np.arange(features.shape[2]) % -(-features.shape[2] // ASKED) == 0
+    left = left - np.einsum("mfn,fn->mn", features[..., ~asked], weights[:, ~asked]) @ gains[~asked]
+    features, gains = features[..., asked], gains[asked]
+    count, actuators = features.shape[1:]
+    columns = np.einsum("mfn,fg->mng", features, root, optimize=True)
+    right = np.einsum("mng,mn->ng", columns, left @ gains.T).ravel()
+    flat = columns.reshape(len(left), -1)
+    shown = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count)))
+
+    def evidence(spread: float) -> float:
+        own, common = alike(actuators, spread)
+        prior = np.kron(own * np.eye(actuators) - common, np.eye(count))
+        factor = cho_factor(shown + prior, lower=True, overwrite_a=True)
+        size = 2.0 * np.log(np.diag(factor[0])).sum()
+        prior_size = count * ((actuators - 1) * np.log(own) - np.log(actuators + spread**2))
+        return float(right @ cho_solve(factor, right) - size + prior_size)
+
+    return max(SPREADS, key=evidence)
