@@ -1,9 +1,10 @@
 """Node `interferometer`: reads map files by request, from a watched folder and after a trigger command, and publishes
 map, map info, Zernike coefficients and samples.
 
-Stamps are the time of the measurement in ROS time: the middle of the trigger command's run; for a file from the watched
-folder its modification time when that is recent; for a file named to `ingest_file` the time in its header, else its
-modification time. Where ROS time is a simulator's, or the file's time cannot be right, it is the time of reading.
+Stamps are the time of the measurement in ROS time: that of `trigger_exposure` in the trigger command's run; for a file
+from the watched folder its modification time when that is recent, less `file_delay`; for a file named to `ingest_file`
+the time in its header, else its modification time. Where ROS time is a simulator's, or the file's time cannot be right,
+it is the time of reading.
 """
 
 import sys
@@ -242,7 +243,8 @@ class InterferometerNode(ManagedNode):
 
     def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()
-        return now if self.get_clock().ros_time_is_active else measured_ns(surface, now, believe_header)
+        time = now if self.get_clock().ros_time_is_active else measured_ns(surface, now, believe_header)
+        return time if believe_header else max(0, time - round(1e9 * self._values["file_delay"]))
 
     def health(self) -> Health:
         acquisition = self._acquisition

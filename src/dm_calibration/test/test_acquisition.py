@@ -192,6 +192,38 @@ def test_a_file_from_before_the_request_is_not_its_measurement_however_late_it_i
     assert one.files == [tmp_path / "first.dat", tmp_path / "before.dat"]
 
 
+def test_what_an_instrument_exposed_before_the_request_is_passed_over(tmp_path: Path, bench: Any) -> None:
+    """It measures on by itself, and ends a file 0.3 s after the exposure of its map."""
+    one, results = bench(tmp_path, file_delay=0.3), []
+    thread = threading.Thread(target=lambda: results.append(one.acquisition.acquire(20)))
+    thread.start()
+    wait_until(lambda: one.acquisition._waiting is not None, what="the request")
+    (tmp_path / "exposed_before.dat").write_bytes(MAP)
+    wait_until(lambda: one.files, what="the file that is passed over")
+    time.sleep(0.3)
+    (tmp_path / "exposed_after.dat").write_bytes(MAP)
+    thread.join(20)
+    assert results[0][0].file == str(tmp_path / "exposed_after.dat")
+    assert one.files == [tmp_path / "exposed_before.dat"]
+
+
+def test_files_that_all_come_too_soon_are_told(tmp_path: Path, bench: Any) -> None:
+    one = bench(tmp_path, file_delay=30.0)
+    threading.Timer(0.2, lambda: (tmp_path / "soon.dat").write_bytes(MAP)).start()
+    with pytest.raises(Refusal, match=r"no new map file .* in time; 1 ended within file_delay, 30 s, of the request"):
+        one.acquisition.acquire(2.0)
+
+
+@pytest.mark.parametrize("exposed", [0.0, 1.0])
+def test_a_map_counts_as_of_its_exposure_in_the_run_of_the_command(tmp_path: Path, bench: Any, exposed: float) -> None:
+    code = "import sys, time; open(sys.argv[2], 'wb').write(open(sys.argv[1], 'rb').read()); time.sleep(0.05)"
+    (tmp_path / "source").write_bytes(MAP)
+    command = python(code, str(tmp_path / "source"), "{path}")
+    one = bench(tmp_path, command, trigger_exposure=exposed)
+    surface, measured = one.acquisition.acquire(20)
+    assert (measured.stamp_ns > surface.written_ns) == bool(exposed)
+
+
 def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
     with pytest.raises(Refusal, match="no new map file"):
         bench(tmp_path).acquisition.acquire(0.2)

@@ -49,6 +49,15 @@ class AcquisitionSettings:
         text(".datx"), "Ending of the file name that replaces {path}.", name="trigger_output_suffix"
     )
     trigger_timeout: float = parameter(real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command.")
+    trigger_exposure: float = parameter(
+        real(0.5, 0.0, 1.0),
+        "When the map is exposed in the run of trigger_command, as a share of it: 0 = at its start.",
+    )
+    file_delay: float = parameter(
+        real(0.0, 0.0, 3600.0, "s"),
+        "Time from the exposure of a map to the end of its file, of an instrument that measures on by itself: a file "
+        "that ends sooner after a request shows the mirror as it was before, and the next one is waited for.",
+    )
 
     def __post_init__(self) -> None:
         """Raise ValueError when the settings contradict each other."""
@@ -98,6 +107,7 @@ class Acquisition:
         self._handover = threading.Lock()
         self._waiting: queue.SimpleQueue[Path] | None = None
         self._before: set[Signature] = set()
+        self._from_ns = self._too_soon = 0  # files of earlier times do not count for a request, and how many came
         self._numbers = count(1)
 
     def start(self) -> None:
@@ -121,7 +131,7 @@ class Acquisition:
         """Trigger a measurement, or wait for the next new file when there is no trigger command.
 
         Returns:
-            The oriented map, and what was found in it, of the middle of the trigger command's run; its time is not
+            The oriented map, and what was found in it, of when the trigger command has it exposed; its time is not
             known when the file came without a trigger.
 
         Raises:
@@ -148,11 +158,11 @@ class Acquisition:
         return surface, replace(measured, stamp_ns=taken)
 
     def _trigger(self, output: Path | None, timeout_s: float) -> int:
-        """Run the trigger command; returns the middle of its run, ns."""
+        """Run the trigger command; returns when the map was exposed, ns."""
         began = self._now_ns()
         run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
         self._check_stopped()
-        return (began + self._now_ns()) // 2
+        return began + round(self.settings.trigger_exposure * (self._now_ns() - began))
 
     def _check_stopped(self) -> None:
         if self._stop.is_set():
@@ -201,7 +211,9 @@ class Acquisition:
         """Where the next file in the folder arrives that is written from now on."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
-            self._waiting, self._before = arrivals, set()
+            self._waiting, self._before, self._too_soon = arrivals, set(), 0
+            delay = 0.0 if self.settings.trigger_command else self.settings.file_delay
+            self._from_ns = time.time_ns() + round(1e9 * delay) if delay else 0
             with suppress(OSError):  # a folder that comes later
                 self._before = set(watch.signatures().values())
         try:
@@ -223,6 +235,11 @@ class Acquisition:
             except queue.Empty:
                 if remaining <= 0:
                     reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
+                    if self._too_soon:
+                        delay = self.settings.file_delay
+                        reason += (
+                            f"; {self._too_soon} ended within file_delay, {delay:g} s, of the request by their times"
+                        )
                     raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
 
     def _run(self, watch: FolderWatch, stop: threading.Event) -> None:
@@ -260,9 +277,11 @@ class Acquisition:
         with self._handover:
             # A file from before the request shows the mirror as it was then, however late it is noticed.
             if self._waiting is not None and event.signature not in self._before:
-                self._waiting.put(event.path)
-                self._waiting = None  # one file per request
-                return
+                if event.signature.modified_ns >= self._from_ns:
+                    self._waiting.put(event.path)
+                    self._waiting = None  # one file per request
+                    return
+                self._too_soon += 1
         self._on_file(event.path)
 
 
