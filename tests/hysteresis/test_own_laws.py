@@ -142,8 +142,11 @@ def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.Mo
     monkeypatch.setattr(law_shape, "slope_min", slope)
     assert identify(run, check, COMMON).fit.law is asked[-1]  # of all maps
     falls, asked = len(asked), []
-    kept = identify(run, check, COMMON).fit.law
-    assert len(asked) == falls and any(kept is law for law in asked[:-1])
+    found = identify(run, check, COMMON)
+    assert len(asked) == falls and any(found.fit.law is law for law in asked[:-1])
+    assert found.refused == {
+        "the fit that takes in the test moves": "its slope falls to -1.00: it could not be inverted safely"
+    }
 
 
 def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_nothing() -> None:

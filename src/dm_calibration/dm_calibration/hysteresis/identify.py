@@ -53,7 +53,7 @@ class Identification:
             of the run in turn; NaN = not predicted.
         scores: held-out error of each candidate relative to the best; that of the best before it, of a richer one that
             leaves hardly less in the maps it was fitted to.
-        refused: candidates that cannot be inverted, or creep without bound, with the reason.
+        refused: candidates that cannot be inverted, or creep without bound, with the reason; the final fit too.
         quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
@@ -131,9 +131,8 @@ def identify(
         whole = whole or problem.fit(train)
         if not whole.candidate.own and whole.candidate.slopes:
             fading.append(whole)
-        slope = law_shape.slope_min(whole.law, *run.in_use).min()
-        if slope < slope_min:
-            refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
+        if flat := _too_flat(run, whole, slope_min):
+            refused[name] = flat
             return
         if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
             refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not tell its creep"
@@ -176,7 +175,9 @@ def identify(
                 if left_out.any():
                     held_out[left_out] = problem.fit(usable & ~left_out, fitted).residual[left_out]
         whole = problem.fit(usable, fitted)
-        if law_shape.slope_min(whole.law, *run.in_use).min() >= slope_min:
+        if flat := _too_flat(run, whole, slope_min):
+            refused["the fit that takes in the test moves"] = flat
+        else:
             fitted = whole
     return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused, quiet)
 
@@ -197,6 +198,15 @@ def _begun(
             yield made[number]
     else:
         yield from fitted
+
+
+def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
+    """Why the law could not be inverted safely; "" = it could."""
+    slope = law_shape.slope_min(fit.law, *run.in_use)
+    if slope.min() >= slope_min:
+        return ""
+    whose = f" of actuator {slope.argmin() + 1}" if slope.size > 1 else ""
+    return f"its slope{whose} falls to {slope.min():.2f}: it could not be inverted safely"
 
 
 def _size(run: Run, residual: Floats) -> float:
