@@ -144,6 +144,7 @@ def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.Mo
     falls, asked = len(asked), []
     found = identify(run, check, COMMON)
     assert len(asked) == falls and any(found.fit.law is law for law in asked[:-1])
+    np.testing.assert_array_equal(found.held_out[check], found.fit.residual[check])  # of the law that is taken
     assert found.refused == {
         "the fit that takes in the test moves": "its slope falls to -1.00: it could not be inverted safely"
     }

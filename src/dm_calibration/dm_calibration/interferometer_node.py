@@ -4,7 +4,7 @@ map, map info, Zernike coefficients and samples.
 Stamps are the time of the measurement in ROS time: that of `trigger_exposure` in the trigger command's run; for a file
 from the watched folder its modification time when that is recent, less `file_delay`; for a file named to `ingest_file`
 the time in its header, else its modification time. Where ROS time is a simulator's, or the file's time cannot be right,
-it is the time of reading.
+the time of reading takes its place.
 """
 
 import sys

@@ -55,8 +55,8 @@ class AcquisitionSettings:
     )
     file_delay: float = parameter(
         real(0.0, 0.0, 3600.0, "s"),
-        "Time from the exposure of a map to the end of its file, of an instrument that measures on by itself: a file "
-        "that ends sooner after a request shows the mirror as it was before, and the next one is waited for.",
+        "Time from the start of an exposure to the end of its file, of an instrument that measures on by itself: a "
+        "file that ends sooner after a request shows the mirror as it was before, and the next one is waited for.",
     )
 
     def __post_init__(self) -> None:
@@ -152,7 +152,11 @@ class Acquisition:
             taken = self._trigger(output, trigger_s)
             surface, measured = self._expected_file(output, deadline)
         else:
-            with self._arrivals(watch) as arrivals:
+            delay = 0.0 if self.settings.trigger_command else self.settings.file_delay
+            if delay >= timeout_s:
+                limit = f"file_delay = {delay:g} s: must be less than the time limit of a measurement, {timeout_s:g} s"
+                raise Refusal(ErrorCode.MAP_TIMEOUT, limit)
+            with self._arrivals(watch, delay) as arrivals:
                 taken = self._trigger(None, trigger_s) if self.settings.trigger_command else 0
                 surface, measured = self._next_file(watch, arrivals, deadline)
         return surface, replace(measured, stamp_ns=taken)
@@ -207,12 +211,11 @@ class Acquisition:
             time.sleep(_POLL_OUTPUT_S)
 
     @contextmanager
-    def _arrivals(self, watch: FolderWatch) -> Iterator[queue.SimpleQueue[Path]]:
-        """Where the next file in the folder arrives that is written from now on."""
+    def _arrivals(self, watch: FolderWatch, delay: float) -> Iterator[queue.SimpleQueue[Path]]:
+        """Where the next file in the folder arrives that is written from now on, and not before `delay` s are over."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
             self._waiting, self._before, self._too_soon = arrivals, set(), 0
-            delay = 0.0 if self.settings.trigger_command else self.settings.file_delay
             self._from_ns = time.time_ns() + round(1e9 * delay) if delay else 0
             with suppress(OSError):  # a folder that comes later
                 self._before = set(watch.signatures().values())
@@ -277,7 +280,7 @@ class Acquisition:
         with self._handover:
             # A file from before the request shows the mirror as it was then, however late it is noticed.
             if self._waiting is not None and event.signature not in self._before:
-                if event.signature.modified_ns >= self._from_ns:
+                if min(event.signature.modified_ns, time.time_ns()) >= self._from_ns:  # whatever its clock says
                     self._waiting.put(event.path)
                     self._waiting = None  # one file per request
                     return

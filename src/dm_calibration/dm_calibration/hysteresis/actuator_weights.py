@@ -19,7 +19,7 @@ _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Standard deviations between actuators, relative to that of the common weights, of which the likeliest is taken: 0.1
 #: or 0.2 on mirrors whose densities of relays are like each other's to 15 %, up to 0.8 where each is of its own.
 SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
-#: How many actuators, spread over the mirror, are asked: the time that this takes grows with the third power.
+#: How many actuators at most, spread over the mirror, are asked: the time that this takes grows with the third power.
 ASKED = 40
 
 
@@ -50,7 +50,7 @@ def weights_of(
     alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
     together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
 
-    def evidence(flat: Floats) -> Floats:
+    def normal(flat: Floats) -> Floats:
         unknown = flat.reshape(actuators, count, 1)
         shown = (rows @ (seen @ (columns @ unknown)[..., 0])[..., None])[..., 0]
         return np.asarray(shown + own * unknown[..., 0] - common * unknown[..., 0].sum(axis=0)).ravel()
@@ -64,7 +64,7 @@ def weights_of(
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
     tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
     first = np.linalg.solve(root, begin).T.ravel()
-    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, first, M=preconditioner, **tolerance)
+    unknown, _ = cg(LinearOperator(shape, normal, dtype=np.float64), right, first, M=preconditioner, **tolerance)
     return np.asarray(root @ unknown.reshape(actuators, count).T)
 
 

@@ -123,7 +123,7 @@ def identify(
     refused: dict[str, str] = {}
 
     def size(residual: Floats) -> float:
-        return _size(run, residual[train] / scatter)
+        return _size(run, residual[train])
 
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
@@ -177,6 +177,7 @@ def identify(
         whole = problem.fit(usable, fitted)
         if flat := _too_flat(run, whole, slope_min):
             refused["the fit that takes in the test moves"] = flat
+            held_out = np.where(test[:, None], fitted.residual, np.nan)
         else:
             fitted = whole
     return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused, quiet)
@@ -193,7 +194,7 @@ def _begun(
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
         made = list(fitted)
-        left = [_size(run, fit.residual[keep] / scatter) for _, fit in made]
+        left = [_size(run, fit.residual[keep]) for _, fit in made]
         for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
             yield made[number]
     else:
@@ -205,8 +206,8 @@ def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
     slope = law_shape.slope_min(fit.law, *run.in_use)
     if slope.min() >= slope_min:
         return ""
-    whose = f" of actuator {slope.argmin() + 1}" if slope.size > 1 else ""
-    return f"its slope{whose} falls to {slope.min():.2f}: it could not be inverted safely"
+    whose = f"the slope of actuator {slope.argmin() + 1}" if slope.size > 1 else "its slope"
+    return f"{whose} falls to {slope.min():.2f}: it could not be inverted safely"
 
 
 def _size(run: Run, residual: Floats) -> float:

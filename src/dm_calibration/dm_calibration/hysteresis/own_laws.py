@@ -98,7 +98,8 @@ class OwnLaws:
         slope_min: of each law, see SHRUNK.
 
     Attributes:
-        spread: of the patterns between actuators; None = before half of the first rounds, whose maps tell it.
+        spread: of the patterns between actuators, told by the maps of the first fit, with which later ones of other
+            maps begin; None = before half of its rounds.
     """
 
     def __init__(

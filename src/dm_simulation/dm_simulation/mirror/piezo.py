@@ -30,7 +30,10 @@ class PiezoConfig:
     law: str = parameter(
         text("prandtl_ishlinskii", choices=tuple(LAWS)), "Hysteresis law; drawn_* = each actuator its own, by the seed."
     )
-    hysteresis: float = parameter(real(0.10, 0.0, 0.3), "Widest loop opening over the full stroke.")
+    hysteresis: float = parameter(
+        real(0.10, 0.0, 0.3),
+        "Widest loop opening over the full stroke; of drawn laws at most 0.8 of what each can have.",
+    )
     hysteresis_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative loop openings.")
     creep: float = parameter(real(0.01, 0.0, 0.1), "Creep of a step per decade of time, as a fraction of the step.")
     creep_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative creep.")
