@@ -64,6 +64,8 @@ CREEP_SLOPE = 0.3
 #: errors up to four times as large, with 60 hardly better. Of shorter runs as many more: of 100 maps 60 leave up to a
 #: quarter less than 20, on some mirrors a tenth more.
 ROUNDS, ROUNDS_MAPS = 20, 300
+#: Maps for each actuator that tell how far actuators differ: of fewer, fitted so closely, too much is found.
+ASKED_MAPS = 5
 #: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps, none of which
 #: leaves less than LEAST of it. Where more than a tenth would have to go and its Duhem operator is its own, it takes
 #: the common one first. One of many may fall where hardly a map shows it.
@@ -99,7 +101,7 @@ class OwnLaws:
 
     Attributes:
         spread: of the patterns between actuators, told by the maps of the first fit, with which later ones of other
-            maps begin; None = before half of its rounds.
+            maps begin; None = before half of its rounds, or not told by so few maps.
     """
 
     def __init__(
@@ -215,7 +217,7 @@ class OwnLaws:
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            ask = self.spread is None and number == self._rounds_needed // 2
+            ask = self.spread is None and number == self._rounds_needed // 2 and len(free) >= ASKED_MAPS * len(gains)
             patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, root, ask)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
