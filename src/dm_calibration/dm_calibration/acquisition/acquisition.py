@@ -154,8 +154,8 @@ class Acquisition:
         else:
             delay = 0.0 if self.settings.trigger_command else self.settings.file_delay
             if delay >= timeout_s:
-                limit = f"file_delay = {delay:g} s: must be less than the time limit of a measurement, {timeout_s:g} s"
-                raise Refusal(ErrorCode.MAP_TIMEOUT, limit)
+                reason = f"file_delay = {delay:g} s: must be less than the time limit of a measurement, {timeout_s:g} s"
+                raise Refusal(ErrorCode.MAP_TIMEOUT, reason)
             with self._arrivals(watch, delay) as arrivals:
                 taken = self._trigger(None, trigger_s) if self.settings.trigger_command else 0
                 surface, measured = self._next_file(watch, arrivals, deadline)

@@ -19,6 +19,8 @@ _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Standard deviations between actuators, relative to that of the common weights, of which the likeliest is taken: 0.1
 #: or 0.2 on mirrors whose densities of relays are like each other's to 15 %, up to 0.8 where each is of its own.
 SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
+#: The one that is taken before they are asked, and where they are not.
+SPREAD = 0.1
 #: How many actuators at most, spread over the mirror, are asked: the time that this takes grows with the third power.
 ASKED = 40
 
@@ -86,10 +88,9 @@ def likeliest_spread(features: Floats, left: Floats, gains: Floats, root: Floats
 
     def evidence(spread: float) -> float:
         own, common = alike(actuators, spread)
-        prior = np.kron(own * np.eye(actuators) - common, np.eye(count))
-        factor = cho_factor(shown + prior, lower=True, overwrite_a=True)
+        between = own * np.eye(actuators) - common
+        factor = cho_factor(shown + np.kron(between, np.eye(count)), lower=True, overwrite_a=True)
         size = 2.0 * np.log(np.diag(factor[0])).sum()
-        prior_size = count * ((actuators - 1) * np.log(own) - np.log(actuators + spread**2))
-        return float(right @ cho_solve(factor, right) - size + prior_size)
+        return float(right @ cho_solve(factor, right) - size + count * np.linalg.slogdet(between)[1])
 
     return max(SPREADS, key=evidence)

@@ -21,7 +21,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from dm_calibration.hysteresis.actuator_weights import SPREADS, alike, likeliest_spread, weights_of
+from dm_calibration.hysteresis.actuator_weights import SPREAD, alike, likeliest_spread, weights_of
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
@@ -279,7 +279,7 @@ class OwnLaws:
         left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
         if ask:
             self.spread = likeliest_spread(features, left, gains, root, begin[1:])
-        between = alike(features.shape[2], self.spread or SPREADS[1])
+        between = alike(features.shape[2], self.spread or SPREAD)
         solved = weights_of(features, left, gains, root, between, begin[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
