@@ -55,6 +55,7 @@ def points_of(depth: NDArray[np.float32], info: CameraInfo) -> NDArray[np.float6
     )
 
 
+@pytest.mark.slow
 def test_a_cloud_of_points_is_where_the_objects_are() -> None:
     """Three flat objects side by side: their corners in space, by the projection that goes with the depth image."""
     distances = (6.0, 15.0, 40.0)

@@ -60,6 +60,7 @@ def test_results_are_absolute_with_the_reference_that_the_bench_leaves(turned: d
     assert error(file, truth, replace(settings, reference=reference)) < 1e-9 < 8e-9 < error(file, truth, settings)
 
 
+@pytest.mark.slow
 def test_retrace_error_from_the_tilts_that_maps_happen_to_have(tmp_path: Path) -> None:
     with bench(tmp_path, retrace=0.01, tilt_spread=2e-6) as simulated:
         files = [simulated.measure() for _ in range(13)]
@@ -78,6 +79,7 @@ def test_regions_that_stand_off_by_whole_fringes_are_brought_back(tmp_path: Path
     assert sum(Ingest().read(file, SETTINGS)[0].phase_steps for file in files) > 6
 
 
+@pytest.mark.slow
 def test_ripples_by_vibration_average_out(tmp_path: Path) -> None:
     with bench(tmp_path, vibration=10e-9, tilt_spread=0.0) as simulated:
         files = [simulated.measure() for _ in range(32)]

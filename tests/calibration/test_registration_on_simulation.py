@@ -141,12 +141,14 @@ def test_an_aperture_that_follows_the_mirror_does_so_with_the_cure() -> None:
     assert np.hypot(*again.registration.shift) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_mirror_as_configured_passes() -> None:
     wiring = np.arange(37)
     found, _ = MountedMirror(PlateConfig(), CAMERA, wiring).check(IngestSettings(aperture_radius=RADIUS), wiring)
     assert found.passed and "not mirrored" in found.pose
 
 
+@pytest.mark.slow
 def test_an_aperture_that_the_camera_does_not_hold() -> None:
     """No parameter helps: the mirror has to be moved."""
     wiring = np.arange(37)

@@ -210,6 +210,7 @@ def test_a_verb_that_is_interrupted_ends_with_130(error: BaseException, monkeypa
     assert (done.exit_code, "error: interrupted" in done.output) == (130, True)
 
 
+@pytest.mark.slow
 def test_with_nothing_running_the_way_out_is_named_at_once(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -359,6 +360,7 @@ def test_a_suite_that_is_started_twice_is_named(tmp_path: Path, monkeypatch: pyt
         pass
 
 
+@pytest.mark.slow
 def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     """As `./dm` starts it: the signal waits until the command can answer it."""
     # A job in the background of a shell, which tests may be, ignores the signal and so would what it starts.

@@ -49,6 +49,7 @@ def bench(changes: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {node: values | changes.get(node, {}) for node, values in GOOD.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bench.yaml", "mirror_19.yaml", "membrane_37.yaml"])
 def test_the_shipped_benches_are_well(name: str) -> None:
     config = load_config(shared_config(name))

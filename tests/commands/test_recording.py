@@ -184,6 +184,7 @@ def test_a_recording_of_rosbag2_gives_the_same_calibration(
     assert differences(recalibrate(session, "again", 2), live) == []
 
 
+@pytest.mark.slow
 def test_a_recording_without_hidden_topics_says_how_to_make_one(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
 ) -> None:
@@ -193,6 +194,7 @@ def test_a_recording_without_hidden_topics_says_how_to_make_one(
         read_session(BagReader(tmp_path / "theirs"))
 
 
+@pytest.mark.slow
 def test_a_recording_of_another_version_is_refused(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
 ) -> None:
@@ -203,6 +205,7 @@ def test_a_recording_of_another_version_is_refused(
         read_session(BagReader(tmp_path / "theirs"))
 
 
+@pytest.mark.slow
 def test_a_difference_of_one_bit_is_found(run_and_bag: tuple[RecordedRun, Any, BagReader]) -> None:
     _run, live, bag = run_and_bag
     again = recalibrate(read_session(bag), "again", 2)
@@ -244,6 +247,7 @@ def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any
     assert told["identical"] is True and Path(told["file"]).is_file()
 
 
+@pytest.mark.slow
 def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
 ) -> None:

@@ -26,6 +26,7 @@ def test_every_rival_finds_a_wide_hill_without_noise(name: str, start: float) ->
     assert end.value.value == pytest.approx(0.0123, abs=0.001)
 
 
+@pytest.mark.slow
 def test_a_scene_is_the_same_for_the_same_seed_and_sharpest_in_focus() -> None:
     assert {draw_scene(seed).texture for seed in range(60)} == set(TEXTURES)
     scene = draw_scene(3)

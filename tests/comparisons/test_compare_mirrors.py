@@ -103,6 +103,7 @@ def test_numbers_of_maps_are_refused_where_they_would_mean_nothing(others: list[
     assert "--maps" in result.output
 
 
+@pytest.mark.slow
 def test_pokes_of_as_many_maps_and_what_is_told_of_each_number(capsys: pytest.CaptureFixture[str]) -> None:
     """Each pattern is legal and enough of them tell all actuators; a mirror without requests is named."""
     mirror = SimulatedBench(draw_mirror(3, 100).simulation).mirror

@@ -34,6 +34,7 @@ def study() -> SamplingStudy:
     return study_sampling(bumpy_surfaces(4, 1), APERTURE, 1 * NM, np.random.default_rng(2), dropout=1e-3, draws=30)
 
 
+@pytest.mark.slow
 def test_every_pixel_beats_points_and_area_weights_beat_none(study: SamplingStudy) -> None:
     bias = {name: result.bias_rms for name, result in study.results.items()}
     assert study.beyond_rms > 10 * NM

@@ -40,6 +40,7 @@ def test_both_sides_compute_the_same_check_sums(name: str, data: bytes) -> None:
     assert CHECK_LENGTH[name] == CHECK_SUMS[name].length
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(st.data())
 def test_what_the_driver_encodes_the_unit_decodes(data: st.DataObject) -> None:

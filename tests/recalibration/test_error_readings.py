@@ -75,6 +75,7 @@ def test_points_without_data_do_not_disturb() -> None:
         assert other.predicted == pytest.approx(one.predicted, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_map_that_was_dropped_leaves_the_regression() -> None:
     maps, _ = calibrated()
     without = fit_influence(maps, exclude=["p20"])

@@ -57,6 +57,7 @@ def folder(module: str) -> str:
     return module if is_package(module) else module.rpartition(".")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_what_is_installed_needs_nothing_of_the_checkout(package: str) -> None:
     for module in (name for name in MODULES if name.split(".")[0] == package):
@@ -82,6 +83,7 @@ def loaded(module: str) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_the_focus_controller_is_on_its_own() -> None:
     modules = loaded("dm_controller.focus_controller_node")
     assert {name.split(".")[0] for name in modules} == {"dm_common", "dm_controller"}
@@ -95,6 +97,7 @@ def test_the_focus_controller_is_on_its_own() -> None:
     assert 0 < len(started) <= NODE_MODULES_MAX, sorted(started)
 
 
+@pytest.mark.slow
 def test_the_calibration_node_starts_without_what_draws_reports() -> None:
     script = (
         "import sys, dm_calibration.calibration_node; "

@@ -277,6 +277,7 @@ def test_another_distribution_of_ros_does_not_stand_in_for_the_wheels(tmp_path: 
     )
 
 
+@pytest.mark.slow
 def test_the_doctor_of_a_checkout_that_is_ready_asks_for_no_compiler() -> None:
     command = [sys.executable, str(ROOT / "dm"), "doctor", "--help"]
     subprocess.run(command, env=os.environ | {"PATH": ""}, check=True, capture_output=True)

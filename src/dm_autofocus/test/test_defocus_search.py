@@ -81,6 +81,7 @@ def test_the_focus_is_found_in_few_images(model: DefocusModel, place: float, sta
         assert visited[0] > 0, "the nearer one first"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [-0.03, 0.0])
 def test_what_stands_beside_the_region_at_another_distance_misleads_no_search(other: float) -> None:
     """Its blur reaches into the region in images far from the focus, and is sharpest where the object is not."""
@@ -125,6 +126,7 @@ def test_nothing_to_see_ends_without_a_focus_and_without_a_sweep(model: DefocusM
     assert np.diff(np.sort([LOW, *visited, HIGH])).max() <= 0.1001 * (HIGH - LOW)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [11, 14, 18])
 def test_nothing_to_see_takes_no_more_images_than_a_sweep(model: DefocusModel, points: int) -> None:
     search = FocusSearch(replace(CONFIG, coarse_points=points), model, 0.0)
@@ -132,6 +134,7 @@ def test_nothing_to_see_takes_no_more_images_than_a_sweep(model: DefocusModel, p
     assert search.current.done and len(visited) <= points
 
 
+@pytest.mark.slow
 def test_what_is_seen_only_after_many_images_is_searched_and_not_swept(
     model: DefocusModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +207,7 @@ def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
     assert search.measured == before + len(visited) <= search.steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told", [0.25, 0.5, 1.0])
 def test_optics_that_contradict_the_images_are_named_with_what_would_fit(told: float) -> None:
     """Who gives half the focal length hears that twice as much would fit; who gives the right one hears nothing."""

@@ -46,6 +46,7 @@ def test_the_image_is_sharp_on_both(stack: ImageStack) -> None:
     assert off.std() < 0.3 * dull.std()
 
 
+@pytest.mark.slow
 def test_what_shows_nothing_has_no_place() -> None:
     blank = np.ones_like(clouds())
     for count in (5, 11, 30):

@@ -39,6 +39,7 @@ def follow(model: DefocusModel, start: float, speed: float, images: int) -> tupl
     return tracker, np.abs(off) / DEPTH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 0.02, -0.02])
 def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: float) -> None:
     """An object that comes nearer by 1 m/s at 5 m: 0.02 1/m per second, half a depth of focus from image to image."""
@@ -48,12 +49,14 @@ def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: flo
     assert tracker.speed == pytest.approx(speed, abs=0.005)
 
 
+@pytest.mark.slow
 def test_it_ends_near_the_end_of_the_range(model: DefocusModel) -> None:
     """Where the object was a few images before it was lost."""
     tracker, _off = follow(model, HIGH - 0.01, 0.03, 30)
     assert HIGH - tracker.centre < BEFORE * 0.03 * PERIOD + DEPTH and LOW <= tracker.step.curvature <= HIGH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("direction", "end"), [(1, 0.013), (-1, 0.007)])
 def test_it_stays_where_the_mirror_reaches_no_farther(model: DefocusModel, direction: int, end: float) -> None:
     """Be it less than half of the range that there was."""
@@ -73,6 +76,7 @@ def test_it_stays_where_the_mirror_reaches_no_farther(model: DefocusModel, direc
             tracker.refuse(math.nan, math.nan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cover", [0.1, 4.0])
 def test_the_focus_waits_while_somebody_walks_past(model: DefocusModel, cover: float) -> None:
     """Duller or sharper than the object: for half a second nothing of theirs is believed."""

@@ -187,6 +187,7 @@ def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..
         run(code, remap=["image_raw"])
 
 
+@pytest.mark.slow
 def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[..., Suite]) -> None:
     with run("import os; os.kill(os.getpid(), 9)") as suite:
         told, pauses = revived(suite, 2)
@@ -241,6 +242,7 @@ with suite.Suite({"calibration": {}}, pathlib.Path(sys.argv[1]), nodes=("calibra
 """
 
 
+@pytest.mark.slow
 def test_nodes_go_with_a_suite_that_is_killed(run: Callable[..., Suite], tmp_path: Path) -> None:
     log = run(NODE).log("calibration")
     with own_domain() as domain:

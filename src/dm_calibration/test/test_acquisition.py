@@ -108,6 +108,7 @@ def test_failing_command(tmp_path: Path, bench: Any, command: list[str], words: 
         bench(tmp_path, command).acquisition.acquire(20)
 
 
+@pytest.mark.slow
 def test_hanging_command_is_ended_with_its_children(tmp_path: Path) -> None:
     child = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-S', '-c', {child!r}, sys.argv[1]])"
@@ -119,6 +120,7 @@ def test_hanging_command_is_ended_with_its_children(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_command_that_writes_nothing(tmp_path: Path, bench: Any) -> None:
     with pytest.raises(Refusal, match="did not appear in time"):
         bench(tmp_path, python("", "{path}")).acquisition.acquire(1.0)
@@ -141,6 +143,7 @@ def test_command_whose_file_is_found_in_the_folder(tmp_path: Path, bench: Any) -
     assert one.files == []
 
 
+@pytest.mark.slow
 def test_a_map_of_a_command_that_fails_afterwards_is_a_file_like_any_other(tmp_path: Path, bench: Any) -> None:
     (tmp_path / "source").write_bytes(MAP)
     code = "import shutil, sys, time; shutil.copy(sys.argv[1], sys.argv[2]); time.sleep(1); sys.exit(3)"
@@ -193,6 +196,7 @@ def test_a_file_from_before_the_request_is_not_its_measurement_however_late_it_i
     assert one.files == [tmp_path / "first.dat", tmp_path / "before.dat"]
 
 
+@pytest.mark.slow
 def test_what_an_instrument_exposed_before_the_request_is_passed_over(tmp_path: Path, bench: Any) -> None:
     """It measures on by itself, and ends a file 0.3 s after the exposure of its map."""
     one, results = bench(tmp_path, file_delay=0.3), []
@@ -208,6 +212,7 @@ def test_what_an_instrument_exposed_before_the_request_is_passed_over(tmp_path: 
     assert one.files == [tmp_path / "exposed_before.dat"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [0.0, 60.0])
 def test_files_that_all_come_too_soon_are_told(tmp_path: Path, bench: Any, ahead: float) -> None:
     """Whatever the clock of their writer says."""
@@ -240,6 +245,7 @@ def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
         bench(tmp_path).acquisition.acquire(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("patience", "complaints"), [(0.1, 1), (20.0, 0)])
 def test_folder_that_does_not_exist_is_waited_for_and_reported_once_when_that_takes_long(
     tmp_path: Path, bench: Any, monkeypatch: pytest.MonkeyPatch, patience: float, complaints: int

@@ -66,6 +66,7 @@ def run_example(name: str, argument: Path, monkeypatch: pytest.MonkeyPatch) -> d
     return runpy.run_path(str(EXAMPLES / name))
 
 
+@pytest.mark.slow
 def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     mirror = make_mirror()
     plant, inside = plant_on_pixels(mirror)
@@ -115,6 +116,7 @@ def test_a_file_without_data_in_a_folder_wants_the_times(tmp_path: Path) -> None
     assert [record.stamp_ns / 1e9 for record in outcome.records][-4:] == list(times)
 
 
+@pytest.mark.slow
 def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
     """A poke shows the loop of one actuator; in a sphere all of them err alike."""
     bench = lagging_bench()
@@ -195,6 +197,7 @@ def test_arrays_of_commands_times_and_maps(
     assert f"{known.name}: coefficients right to" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_measurements_and_what_is_refused() -> None:
     mirror = make_mirror(rings=1)
     plant, inside = plant_on_pixels(mirror)

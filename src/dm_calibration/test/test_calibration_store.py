@@ -118,6 +118,7 @@ def test_a_second_save_never_replaces(tmp_path: Path, calibration: Calibration) 
     assert (tmp_path / "PDM_1.h5").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_disk_full_leaves_everything_as_it_was(tmp_path: Path, calibration: Calibration) -> None:
     """A child process whose files may not grow beyond 20 kB meets a failing write, as on a full disk."""
     CalibrationStore(tmp_path).save(calibration)
@@ -193,6 +194,7 @@ def test_new_ids_are_unique_and_safe(tmp_path: Path, calibration: Calibration) -
     assert store.new_id("PDM30-37", "S 7/é", 10**18) == first + "-2"
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(truncate=st.booleans(), share=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
 def test_damage_is_noticed(truncate: bool, share: float, bit: int, damaged: tuple[CalibrationStore, bytes]) -> None:

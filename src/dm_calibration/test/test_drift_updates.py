@@ -90,6 +90,7 @@ def test_a_map_that_agrees_is_taken(bench: SteadyMirror, updates: RecalibrationM
     assert known(updates).checked_ns == bench.clock_ns
 
 
+@pytest.mark.slow
 def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
     updates = begun(made, tmp_path)
     rng = np.random.default_rng(11)
@@ -289,6 +290,7 @@ def at_20_degrees(made: Made) -> Made:
     return bench, replace(calibration, maps=replace(maps, temperature=np.full(len(maps), 20.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "figure"), [(1e-3, 2e-9), (0.0, 3e-9), (-2e-3, 0.0)])
 def test_what_the_temperature_does_is_foretold(
     bench: SteadyMirror, made: Made, tmp_path: Path, gain: float, figure: float

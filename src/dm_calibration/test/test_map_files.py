@@ -318,6 +318,7 @@ def test_both_formats_of_one_measurement_hold_the_same_counts(tmp_path: Path) ->
     assert binary.origin == text.origin
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_an_independent_reader_agrees(tmp_path: Path, name: str) -> None:
     """The files made here are legal: a program that shares nothing with this suite reads the same heights."""

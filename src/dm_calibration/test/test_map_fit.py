@@ -34,6 +34,7 @@ def rough_map(shape: tuple[int, int], seed: int, dropout: float = 0.05) -> np.nd
     return np.where(rng.random(shape) < dropout, np.nan, sag)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),

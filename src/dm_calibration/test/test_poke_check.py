@@ -193,6 +193,7 @@ def test_without_noise_nothing_differs() -> None:
     assert check(PLANT.influence).passed
 
 
+@pytest.mark.slow
 def test_an_arrangement_without_symmetry() -> None:
     """Actuators in the shape of an F: each turn and image is told from all others."""
     grid = np.array([(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 4), (2, 4), (1, 2)])

@@ -23,6 +23,7 @@ def assert_same_maps(one: MapSet, other: MapSet) -> None:
             assert a == b, column.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -41,6 +42,7 @@ def test_a_run_made_again_is_the_same_to_the_last_bit(kind: PlanKind, options: P
     assert replayed.influence_zernike.tobytes() == live.influence_zernike.tobytes()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_accurate_enough_ends_where_it_did() -> None:
     options = PlanOptions(hysteresis_maps=300, until=2e-9)
     run, outcome = recorded(PlanKind.HYSTERESIS, options, enough=lambda outcome: len(outcome.records) > 150)

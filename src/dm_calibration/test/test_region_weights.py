@@ -277,6 +277,7 @@ def test_azwreg_with_points_without_data() -> None:
     assert np.abs(gappy.influence_zernike - whole.influence_zernike)[3:].max() < 5 * NM
 
 
+@pytest.mark.slow
 def test_a_region_that_a_surface_does_not_show_is_refused() -> None:
     """Its weight would come from sag that the fit made up."""
     _plant, maps = linear_maps()

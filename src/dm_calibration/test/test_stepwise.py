@@ -57,6 +57,7 @@ def test_finds_the_variables_that_matter_and_agrees_with_statsmodels(sm: Any) ->
     assert upper == pytest.approx(frame["obs_ci_upper"].to_numpy())
 
 
+@pytest.mark.slow
 def test_a_variable_made_superfluous_by_later_ones_leaves_again() -> None:
     rng = np.random.default_rng(3)
     x = candidates(3, count=6)
@@ -95,6 +96,7 @@ def test_intervals_hold_their_share_of_new_samples() -> None:
     assert 0.90 < ((lower <= y) & (y <= upper)).mean() < 0.99
 
 
+@pytest.mark.slow
 def test_selection_makes_p_optimistic_and_leaving_out_tells() -> None:
     significant, worse = 0, 0
     for seed in range(10):

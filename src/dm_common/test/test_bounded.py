@@ -39,6 +39,7 @@ def test_metres_and_nanometres_give_the_same_signals() -> None:
     np.testing.assert_allclose(metres, BoundedProgramme(matrix, limits, 1e-3).solve(wanted), atol=1e-8)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), demand=st.floats(0.1, 20.0), difference=st.floats(0.05, 2.5))
 def test_result_is_feasible_and_optimal(seed: int, demand: float, difference: float) -> None:

@@ -244,6 +244,7 @@ def move_of(order: Order) -> Any:
     return order.move
 
 
+@pytest.mark.slow
 def test_it_needs_no_ros() -> None:
     code = "import sys, dm_controller.focus_controller; sys.exit('rclpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -419,6 +420,7 @@ def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its
     FocusHost.await_start(host)  # it asks no more
 
 
+@pytest.mark.slow
 def test_actuators_without_a_channel_are_neither_corrected_nor_kept_where_they_rest(bench: Bench) -> None:
     bench.unused[-1] = True
     bench.degauss()
@@ -1078,6 +1080,7 @@ def test_the_bound_holds_where_nothing_holds_the_shape() -> None:
             assert plan.max_zernike_upper < error < told[1].predicted_max_zernike_upper < 1.1 * bound
 
 
+@pytest.mark.slow
 def test_a_shape_written_again_after_a_lost_link_is_told_with_the_bound_of_an_unknown_history() -> None:
     bench = Bench()
     bench.degauss()

@@ -149,6 +149,7 @@ def test_a_newer_command_takes_over_in_the_middle_of_a_ramp(unit: Edac40TcpUnit)
     assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
 
 
+@pytest.mark.slow
 def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=10.0) as (writer, _told):
         assert writer.command(shape(-0.5)).wait(5) is Outcome.REACHED
@@ -167,6 +168,7 @@ def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -
         assert writer.state().requested == pytest.approx(shape(0.0))
 
 
+@pytest.mark.slow
 def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
     generator = np.random.default_rng(7)
     limiter = SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37))
@@ -231,6 +233,7 @@ def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> N
     assert places[2] == pytest.approx(lowest, abs=CODE) and places[3] == pytest.approx(0.9, abs=CODE)
 
 
+@pytest.mark.slow
 def test_a_move_of_one_step_that_takes_over_hides_no_turn(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=2.0) as (writer, told):
         writer.command(shape(0.9))
@@ -252,6 +255,7 @@ def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40
         assert not writer.state().history_known
 
 
+@pytest.mark.slow
 def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, watchdog_s=0.6) as (writer, _told):
         assert writer.command(shape(0.0)).wait(5) is Outcome.REACHED
@@ -262,6 +266,7 @@ def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
         assert writer.command(shape(-0.9)).wait(5) is Outcome.REACHED
 
 
+@pytest.mark.slow
 def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=20.0) as (writer, _told):
         assert writer.command(shape(0.3)).wait(5) is Outcome.REACHED
@@ -306,6 +311,7 @@ def test_an_impossible_degauss_is_refused(amplitude: float, steps: int) -> None:
     assert refused(lambda: degauss_move(limits(20.0), amplitude, steps, shape(0.0))) is ErrorCode.OUT_OF_RANGE
 
 
+@pytest.mark.slow
 def test_a_degauss_longer_than_the_watchdog_is_finished(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=40.0, watchdog_s=0.1) as (writer, _told):
         assert degauss(writer, 0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
@@ -360,6 +366,7 @@ def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUni
         assert writer.enable(5)
 
 
+@pytest.mark.slow
 def test_a_unit_slower_than_the_limits_is_waited_for_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit) -> None:
     class Slow(Edac40Tcp):
         def _do_write(self, codes: np.ndarray, wired: np.ndarray) -> None:
@@ -489,6 +496,7 @@ def test_a_driver_that_waited_for_the_unit_begins_where_the_other_one_ended(
     assert seen[-1] == pytest.approx(-1.0, abs=CODE)
 
 
+@pytest.mark.slow
 def test_a_second_driver_of_a_unit_that_takes_frames_of_anybody_waits(tmp_path: Path) -> None:
     path = tmp_path / "unit.shape"
     with Edac40UdpUnit(discovery=False) as unit, ExitStack() as waiting:
@@ -508,6 +516,7 @@ def test_a_second_driver_of_a_unit_that_takes_frames_of_anybody_waits(tmp_path: 
     assert np.abs(np.diff(signals_of(unit.frames), axis=0)).max() <= 0.1 + CODE
 
 
+@pytest.mark.slow
 def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=2.0, electronics=Counting) as (writer, _told):
         electronics = writer._electronics
@@ -521,6 +530,7 @@ def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40Tc
         assert electronics.checks - before - (writer.counters.frames - frames) >= 4
 
 
+@pytest.mark.slow
 def test_disable_without_a_link_says_so(unit: Edac40TcpUnit) -> None:
     with running_writer(unit) as (writer, _told):
         unit.unplug()
@@ -535,6 +545,7 @@ def test_stop_ends_a_move_that_somebody_waits_for(unit: Edac40TcpUnit) -> None:
     assert move.wait(5) is Outcome.STOPPED
 
 
+@pytest.mark.slow
 def test_a_defect_in_a_back_end_does_not_end_the_thread(unit: Edac40TcpUnit) -> None:
     class Faulty(Edac40Tcp):
         calls = 0

@@ -93,6 +93,7 @@ def test_other_replies_are_not_units(reply: bytes) -> None:
     assert discovery.parse_reply(reply, "10.0.0.7") is None
 
 
+@pytest.mark.slow
 def test_discovery_over_the_loopback(capsys: pytest.CaptureFixture[str]) -> None:
     with Edac40UdpUnit() as unit:
         port = unit.discovery_port  # type: ignore[attr-defined]

@@ -131,6 +131,7 @@ class TestContract:
         with pytest.raises(NotOpenError):
             electronics.check()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("how", ["write", "check"])
     def test_an_unplugged_unit_is_noticed_and_its_return_taken(
         self, unit: DriveUnit, electronics: DriveElectronics, how: str
@@ -157,11 +158,13 @@ class TestContract:
         electronics.write(codes, wired)
         wait_until(lambda: len(unit.frames) > frames)
 
+    @pytest.mark.slow
     def test_a_unit_that_is_off_cannot_be_opened(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
         unit.unplug()
         with pytest.raises(LinkError, match=r"cannot open .*(127\.0\.0\.1|ttyUSB)"):
             electronics.open()
 
+    @pytest.mark.slow
     def test_a_standing_link_passes_every_check(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
         with electronics:
             end = time.monotonic() + 1.5  # well beyond the time-out
@@ -194,6 +197,7 @@ def test_an_address_holds_no_port_and_nothing_else(kind: str, address: str) -> N
         BACK_ENDS[kind](ElectronicsSettings(address))
 
 
+@pytest.mark.slow
 def test_tcp_notices_between_writes_that_the_unit_closed() -> None:
     with Edac40TcpUnit() as unit:
         electronics = BACK_ENDS["edac40_tcp"](settings_of(unit))
@@ -209,6 +213,7 @@ def test_tcp_notices_between_writes_that_the_unit_closed() -> None:
         electronics.close()
 
 
+@pytest.mark.slow
 def test_a_second_tcp_client_finds_the_unit_taken() -> None:
     with Edac40TcpUnit() as unit:
         with BACK_ENDS["edac40_tcp"](settings_of(unit)) as first:
@@ -232,6 +237,7 @@ def test_udp_without_discovery_notices_a_closed_port() -> None:
             assert not electronics.is_open
 
 
+@pytest.mark.slow
 def test_answers_that_came_twice_are_no_sign_of_life_later() -> None:
     with Edac40UdpUnit(copies=2) as unit, BACK_ENDS["edac40_udp"](settings_of(unit)) as electronics:
         for _ in range(100):

@@ -45,6 +45,7 @@ def until_something_waits(unit: Edac40Tcp) -> None:
     raise AssertionError("everything was taken")
 
 
+@pytest.mark.slow
 def test_a_large_change_waits_for_the_acknowledgement_and_is_not_sent_without(deaf: socket.socket) -> None:
     with Edac40Tcp(ElectronicsSettings("127.0.0.1", deaf.getsockname()[1], timeout_s=0.5, doubt=DOUBT)) as unit:
         connection, _ = deaf.accept()

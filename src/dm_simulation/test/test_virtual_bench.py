@@ -134,6 +134,7 @@ def test_creep_goes_by_the_clock_that_is_given(make: Make) -> None:
     assert np.all((growth > 0.01) & (growth < 0.06))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_maps(make: Make) -> None:
     first, second, other = make(), make(), make(seed=2)
     paths = [bench.measure() for bench in (first, second, other)]
@@ -148,6 +149,7 @@ def run_client(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.slow
 def test_trigger_client(make: Make, tmp_path: Path) -> None:
     bench = make()
     port = str(bench.endpoints["trigger_port"])
@@ -194,6 +196,7 @@ def test_unknown_requests_are_answered(make: Make) -> None:
         assert client.makefile().readline().startswith("ERROR unknown request 'EXPOSE'")
 
 
+@pytest.mark.slow
 def test_ports_are_free_again_after_a_failed_start(make: Make) -> None:
     bench = make()
     config = replace(bench.config, ports=PortsConfig(-1, 0, -1), trigger_port=int(bench.endpoints["trigger_port"]))

@@ -45,6 +45,7 @@ def detail(image: NDArray[np.uint8], number: int) -> float:
     return float(np.mean(np.diff(strip, axis=0) ** 2) + np.mean(np.diff(strip, axis=1) ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(DISTANCES)))
 def test_each_object_is_sharpest_at_its_own_distance(number: int) -> None:
     camera = make()
@@ -119,6 +120,7 @@ def test_light_is_kept_whatever_the_focus() -> None:
     np.testing.assert_allclose(means, means[1], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_images() -> None:
     surface = sphere(0.01)
     np.testing.assert_array_equal(make().expose(surface), make().expose(surface))

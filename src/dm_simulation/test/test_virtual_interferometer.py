@@ -47,6 +47,7 @@ def pixel_grid(camera: Interferometer) -> tuple[Array, Array]:
     return np.meshgrid(along, -along)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diameter", [0.020, 0.022, 0.024, 0.030])
 def test_the_map_is_the_plate_seen_from_above(plate: Plate, diameter: float) -> None:
     camera = make(replace(QUIET, field_diameter=diameter, pixels=90), plate)
@@ -101,6 +102,7 @@ def test_full_camera_has_enough_valid_pixels_and_masks_differ(plate: Plate) -> N
     assert np.any(np.isfinite(maps[0]) != np.isfinite(maps[1]))
 
 
+@pytest.mark.slow
 def test_initial_figure(plate: Plate) -> None:
     camera = make(replace(QUIET, figure_rms=40e-9), plate)
     sag = camera.measure(np.zeros(37))

@@ -53,6 +53,7 @@ def test_it_answers_to_the_square_of_the_volts_and_is_only_pulled() -> None:
     np.testing.assert_array_equal(sag(membrane, -100.0 * pattern, x), one)
 
 
+@pytest.mark.slow
 def test_the_nearer_it_comes_the_more_it_is_pulled_until_it_rests() -> None:
     centre = np.zeros(1)
     near = made(gap=1e-4, tension=60.0)
@@ -62,6 +63,7 @@ def test_the_nearer_it_comes_the_more_it_is_pulled_until_it_rests() -> None:
     assert np.isfinite(sag(torn, np.full(37, 300.0), centre)).all()
 
 
+@pytest.mark.slow
 def test_the_zero_drifts_to_its_end() -> None:
     membrane = made(drift=2e-7, drift_time=100.0)
     membrane.apply(np.zeros(37), 0.0)

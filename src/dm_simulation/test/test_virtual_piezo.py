@@ -36,6 +36,7 @@ def drive(law: Hysteresis, *signals: float) -> Array:
     return np.array([law.move(np.array([u]))[0] for u in signals])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", HYSTERETIC)
 @pytest.mark.parametrize("fraction", [0.05, 0.10, 0.15])
 def test_loop_opens_by_the_stated_fraction_of_a_total_stroke_of_two(law: str, fraction: float) -> None:
@@ -55,6 +56,7 @@ def test_without_hysteresis_the_law_is_a_straight_line() -> None:
     np.testing.assert_allclose(drive(Hysteresis("preisach", 0.0, 1), *grid), grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 @settings(max_examples=25, deadline=None)
 @given(history=st.lists(signal, max_size=8), start=signal, stop=signal)
@@ -64,6 +66,7 @@ def test_branches_are_monotone(law: str, history: list[float], start: float, sto
     assert np.all(np.diff(branch) * np.sign(stop - start) >= -1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", HYSTERETIC)
 @settings(max_examples=25, deadline=None)
 @given(turns=st.lists(signal, min_size=1, max_size=8), cuts=st.integers(2, 9))
@@ -126,6 +129,7 @@ def major_loop_asymmetry(law: str) -> float:
     return float(np.max(np.abs(rising + falling - (rising + falling).mean())))
 
 
+@pytest.mark.slow
 def test_only_the_preisach_loop_is_asymmetric() -> None:
     assert major_loop_asymmetry("prandtl_ishlinskii") < 1e-9
     assert major_loop_asymmetry("bouc_wen") < 1e-3
@@ -159,6 +163,7 @@ def test_unknown_laws_and_impossible_loops_are_refused() -> None:
 DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_unlike", "drawn_jiles_atherton")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", DRAWN_LAWS)
 def test_drawn_laws_follow_from_their_seed_and_differ_between_actuators_and_seeds(law: str) -> None:
     def loop(seed: int) -> Array:
@@ -171,6 +176,7 @@ def test_drawn_laws_follow_from_their_seed_and_differ_between_actuators_and_seed
     assert np.ptp(first[2:], axis=1).min() > 1e-4  # each actuator is another
 
 
+@pytest.mark.slow
 def test_a_drawn_loop_is_no_wider_than_its_density_can_have() -> None:
     law = Hysteresis("drawn_unlike", 0.2, 37, np.random.default_rng(3))
     signals = np.concatenate([np.linspace(-1, 1, 41), np.linspace(1, -1, 41)] * 2)

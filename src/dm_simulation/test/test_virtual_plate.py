@@ -119,6 +119,7 @@ def test_a_very_soft_plate_goes_through_the_bases() -> None:
     np.testing.assert_allclose(plate.influence_at(plate.x, plate.y) @ bases, bases, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_solution_has_converged(plate: Plate) -> None:
     """Energy falls with every order (Ritz), and one poke of half the stroke is good to half a nm."""
     x, y, weights = disc(0.011)
@@ -172,6 +173,7 @@ def test_actuators_at_the_same_place_are_named() -> None:
         neighbour_pairs(plate.x, plate.y)
 
 
+@pytest.mark.slow
 def test_design_numbers(plate: Plate) -> None:
     """Agreed: condition number 11.8 for Zernikes 2-21, coupling 0.46, up to 83 nm beyond 21 terms for one poke of full
     stroke, fitting limit 3.0 / 7.7 / 16.5 nm rms at 20 / 22 / 24 mm. A 1 mm plate: 3.7 and 0.12.
