@@ -170,8 +170,9 @@ class DeformableMirrorClient(Connection):
     def set_signals(
         self, signals: Sequence[float], *, wait: bool = True, **claim: Unpack[Claim]
     ) -> SetSignals.Response:
-        """Set all actuator signals (normalised, -1..+1)."""
-        return self.call("set_signals", filled(SetSignals.Request, signals=signals, wait=wait, **claim))
+        """Set all actuator signals (normalised, -1..+1); with `wait` return when they stand."""
+        request = filled(SetSignals.Request, signals=signals, wait=wait, **claim)
+        return self.call("set_signals", request, math.inf if wait else None)
 
     def degauss(
         self,
@@ -239,7 +240,7 @@ class DeformableMirrorClient(Connection):
         tolerance: float = 0.0,
         settle_time: float = 0.0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
-        timeout_s: float = 30.0,
+        timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> MoveFocus.Result:
         """Move to a curvature and return when the shape stands."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import threading
@@ -10,8 +11,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from dm_msgs.action import Converge
+from dm_msgs.action import Converge, MoveFocus
 from dm_msgs.msg import ActuatorState, Capabilities
+from dm_msgs.srv import SetSignals
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError, connection
 from dm_common.errors import ErrorCode
@@ -123,6 +125,24 @@ def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -
     asked._servers, asked.clients, asked._timeout_s = {}, {"measure": absent}, 0.1
     with pytest.raises(DeformableMirrorError, match=r"no such service within 0\.1 s"):
         asked.measure()
+
+
+def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    asked._servers, asked.clients, asked._timeout_s = {}, dict.fromkeys(("set_signals", "move_focus")), 10.0
+    limits = list[float]()
+
+    def answer(_client: object, request: Any, timeout_s: float, *_more: object, **_options: object) -> Any:
+        limits.append(timeout_s)
+        kind = SetSignals.Response if isinstance(request, SetSignals.Request) else MoveFocus.Result
+        return kind()
+
+    monkeypatch.setattr(connection, "call", answer)
+    monkeypatch.setattr(connection, "run_goal", answer)
+    asked.set_signals([0.0] * 37)
+    asked.move_focus(0.01)
+    asked.set_signals([0.0] * 37, wait=False)
+    assert limits == [math.inf, math.inf, 10.0]
 
 
 def test_what_asks_inside_a_callback_is_refused_at_once() -> None:

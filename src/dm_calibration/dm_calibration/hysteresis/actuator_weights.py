@@ -12,8 +12,8 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from dm_common import Floats
 
-#: Residual of the solved weights, relative: effective signals are within 1e-6 then.
-SOLVED = 1e-6
+#: Residual of the solved weights, relative: effective signals are within 1e-5 then.
+SOLVED = 1e-5
 #: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
 _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 #: Standard deviations between actuators, relative to that of the common weights, of which the likeliest is taken: 0.1
@@ -22,7 +22,7 @@ SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
 #: The one that is taken before they are asked, and where they are not.
 SPREAD = 0.1
 #: How many actuators at most, spread over the mirror, are asked: the time that this takes grows with the third power.
-ASKED = 40
+ASKED = 20
 
 
 def alike(actuators: int, spread: float) -> tuple[float, float]:

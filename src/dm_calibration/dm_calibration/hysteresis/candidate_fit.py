@@ -28,11 +28,11 @@ RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
 #: They end sooner where no effective signal changes by more in a round: far below what a map can show.
-SETTLED = 1e-8
+SETTLED = 1e-6
 #: What makes the equations of the gains solvable where actuators hardly move, as a share of their evidence.
 SOLVABLE = 1e-13
-#: Evaluations of the Gauss-Newton iteration at most, from a guess and from a fit to other rows.
-EVALUATIONS, EVALUATIONS_AGAIN = 20, 8
+#: Evaluations of the Gauss-Newton iteration at most, from a guess and from a fit to other rows, which is one step away.
+EVALUATIONS, EVALUATIONS_AGAIN = 20, 2
 #: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
 #: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
 CREEP_SHOWN, CREEP_SHARE = 10.0, 0.03
