@@ -14,7 +14,7 @@ import typer
 
 from dm_tools.output import JsonOption, console, write_json
 
-#: What `--fast` leaves out: nodes as processes, and whole comparisons, reports and identifications.
+#: What `--fast` leaves out: nodes as processes, and what takes half a second and more.
 FAST = "not processes and not slow"
 _CORES = os.cpu_count() or 1
 #: Much of a node's test is waiting, so two at once for each core, but not more nodes than fit into the memory of a

@@ -34,14 +34,12 @@ from support import fast_bench, wait_until
 
 pytestmark = pytest.mark.processes
 
-#: Within which a missing node is known, s. Measured on two cores at a load of 6 to 15, 100 kills of all nodes: 0.3 to
-#: 1.8 s, the lease and the time to be sure; once 3.3 s. Diagnostics, which come once a second: 1.1 to 2.1 s.
-KNOWN_S = 2.0
-assert qos.LEASE_S + qos.SURE_S < KNOWN_S
-#: After which the ROS graph forgets a node that was killed, s: who waits for that knows it only then.
-FORGOTTEN_S = 20.0
-#: What is allowed where processes get no time for seconds (CI), s.
-ALLOWED_S = 0.6 * FORGOTTEN_S
+# Measured on two cores at a load of 6 to 15, 100 kills of all nodes: known after 0.3 to 1.8 s, the lease and the time
+# to be sure; once 3.3 s. By diagnostics, which come once a second: 1.1 to 2.1 s.
+assert qos.LEASE_S + qos.SURE_S < 2.0
+#: What is allowed where processes get no time for seconds (CI), s; who waits until the ROS graph forgets a node that
+#: was killed, which takes 20 s, fails.
+ALLOWED_S = 12.0
 
 
 @dataclass
@@ -250,8 +248,8 @@ def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:
     answers = [bench.focus() for _ in range(3)]
     assert {answer.error_code for answer in answers} == {ErrorCode.DRIVER_UNAVAILABLE}
     assert not any(answer.state.applied for answer in answers)
+    assert time.monotonic() - began < ALLOWED_S
     assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.DRIVER_UNAVAILABLE, ALLOWED_S)
-    assert time.monotonic() - began < FORGOTTEN_S
     assert bench.client.capabilities.curvature_max == 0.0
     assert bench.client.wait(lambda: "the node pdm_driver has died" in bench.health["calibration"], ALLOWED_S)
     bench.paused = False
@@ -365,5 +363,5 @@ def test_a_run_ends_soon_after_the_driver_has_died(bench: Bench, action: str, go
     bench.kill_and_name(running, "pdm_driver")
     began = time.monotonic()
     assert running.end().error_code == ErrorCode.DRIVER_UNAVAILABLE
-    assert time.monotonic() - began < FORGOTTEN_S  # as long it waited for the driver of before
+    assert time.monotonic() - began < ALLOWED_S  # it waited 20 s for the driver of before
     assert bench.client.wait(bench.all_serve, 60.0)

@@ -62,7 +62,6 @@ def test_the_rule_finds_what_it_forbids(source: str) -> None:
     assert offences(source)
 
 
-@pytest.mark.slow
 def test_no_code_from_text_no_pickle_no_shell() -> None:
     assert len(FILES) > 100
     assert {str(path.relative_to(SOURCE)): found for path in FILES if (found := offences(path.read_text()))} == {}

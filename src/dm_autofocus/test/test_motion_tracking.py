@@ -49,7 +49,6 @@ def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: flo
     assert tracker.speed == pytest.approx(speed, abs=0.005)
 
 
-@pytest.mark.slow
 def test_it_ends_near_the_end_of_the_range(model: DefocusModel) -> None:
     """Where the object was a few images before it was lost."""
     tracker, _off = follow(model, HIGH - 0.01, 0.03, 30)

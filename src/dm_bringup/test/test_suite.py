@@ -242,7 +242,7 @@ with suite.Suite({"calibration": {}}, pathlib.Path(sys.argv[1]), nodes=("calibra
 """
 
 
-@pytest.mark.slow
+@pytest.mark.processes
 def test_nodes_go_with_a_suite_that_is_killed(run: Callable[..., Suite], tmp_path: Path) -> None:
     log = run(NODE).log("calibration")
     with own_domain() as domain:

@@ -29,8 +29,7 @@ def test_moments_of_a_mask_equal_the_plain_product(height: int, width: int, miss
     np.testing.assert_allclose(mask_moments(mask, rows, columns), rows.T @ mask @ columns, atol=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", [(1, 7), (7, 1), (300, 944), (130, 60_000)])
+@pytest.mark.parametrize("shape", [(1, 7), (7, 1), (300, 944), pytest.param((130, 60_000), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_moments_and_energy_of_a_map_equal_the_plain_product(shape: tuple[int, int], order: str) -> None:
     """One row, one column, several blocks of rows, and rows longer than a block; maps turned by 90 degrees are F."""

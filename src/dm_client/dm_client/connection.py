@@ -2,6 +2,7 @@
 
 import atexit
 import itertools
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -194,11 +195,15 @@ class Connection:
             raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
         return found
 
-    def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
-        """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
+    def call(self, name: str, request: Any, timeout_s: float | None = None, again_s: float = math.inf) -> Any:
+        """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer.
+
+        A node just started may lose a request: one that may be carried out twice is sent again after `again_s`.
+        """
         with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            response = call(self.clients[name], request, timeout_s, lambda: bool(gone()), ready_s=self._timeout_s)
+            cancelled, ready_s = (lambda: bool(gone())), self._timeout_s
+            response = call(self.clients[name], request, timeout_s, cancelled, again_s, ready_s=ready_s)
         return checked(response)
 
     def run_action(

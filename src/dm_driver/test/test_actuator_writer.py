@@ -168,7 +168,6 @@ def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -
         assert writer.state().requested == pytest.approx(shape(0.0))
 
 
-@pytest.mark.slow
 def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
     generator = np.random.default_rng(7)
     limiter = SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37))

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from dm_common import Floats
 
-#: Residual of the solved weights, relative: effective signals are within 1e-5 then.
+#: Residual of the solved weights, relative.
 SOLVED = 1e-5
 #: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
 _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
@@ -21,7 +21,8 @@ _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
 SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
 #: The one that is taken before they are asked, and where they are not.
 SPREAD = 0.1
-#: How many actuators at most, spread over the mirror, are asked: the time that this takes grows with the third power.
+#: How many actuators at most, spread over the mirror, are asked, of 37 every second one: the time that this takes grows
+#: with the third power.
 ASKED = 20
 
 

@@ -31,7 +31,7 @@ ROUNDS = 20
 SETTLED = 1e-6
 #: What makes the equations of the gains solvable where actuators hardly move, as a share of their evidence.
 SOLVABLE = 1e-13
-#: Evaluations of the Gauss-Newton iteration at most, from a guess and from a fit to other rows, which is one step away.
+#: Evaluations of the Gauss-Newton iteration at most, from a guess, and from a fit to other rows: there and a step on.
 EVALUATIONS, EVALUATIONS_AGAIN = 20, 2
 #: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
 #: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
