@@ -121,11 +121,12 @@ class Browser:
         button = self.find(name, "button")
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
         # A click goes to a place; what appears above the button meanwhile moves it away from there.
-        wait_until(lambda: self._stands_still(button), 60, f"button {name} to stand still")
+        wait_until(lambda: self.stands_still(button), 60, f"button {name} to stand still")
         button.click()
 
     @staticmethod
-    def _stands_still(element: Any) -> bool:
+    def stands_still(element: Any) -> bool:
+        """Whether nothing moves it for a moment."""
         before = element.rect
         time.sleep(0.1)
         return bool(element.rect == before)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -177,13 +176,9 @@ def test_all_text_stands_out_from_its_ground(
     for title in DETAILS:
         page.unfold(title)
     page.enter("Recipes", "0")
-
-    def still() -> Any:  # what unfolds takes a moment
-        place = page.find("Move", "button").rect
-        time.sleep(0.5)
-        return place if page.find("Move", "button").rect == place else None
-
-    before = wait_until(still, 60, "the page to stand still")
+    move = page.find("Move", "button")
+    wait_until(lambda: page.stands_still(move), 60, "button Move to stand still")  # what unfolds takes a moment
+    before = move.rect
     page.press("Build recipes")
     wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 60, "a refusal")
     assert page.find("Move", "button").rect == before, "a message moves nothing"

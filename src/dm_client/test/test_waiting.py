@@ -130,10 +130,10 @@ def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -
 def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     asked._servers, asked.clients, asked._timeout_s = {}, dict.fromkeys(("set_signals", "move_focus")), 10.0
-    limits = list[float]()
+    limits = list[tuple[float, ...]]()  # of waiting, and after which a request to a service is sent again
 
-    def answer(_client: object, request: Any, timeout_s: float, *_more: object, **_options: object) -> Any:
-        limits.append(timeout_s)
+    def answer(_client: object, request: Any, timeout_s: float, *more: Any, **_options: object) -> Any:
+        limits.append((timeout_s, *more[1:]))
         kind = SetSignals.Response if isinstance(request, SetSignals.Request) else MoveFocus.Result
         return kind()
 
@@ -142,7 +142,7 @@ def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.Mon
     asked.set_signals([0.0] * 37)
     asked.move_focus(0.01)
     asked.set_signals([0.0] * 37, wait=False)
-    assert limits == [math.inf, math.inf, 10.0]
+    assert limits == [(math.inf, 10.0), (math.inf,), (10.0, 10.0)]
 
 
 def test_what_asks_inside_a_callback_is_refused_at_once() -> None:
