@@ -26,7 +26,7 @@ from dm_msgs.msg import (
     SurfaceMapInfo,
     ZernikeCoefficients,
 )
-from dm_msgs.srv import Measure
+from dm_msgs.srv import Measure, SetSignals
 from matplotlib.image import imread
 from nicegui import Client
 from nicegui.page import page as nicegui_page
@@ -612,3 +612,16 @@ def test_a_map_is_waited_for_as_long_as_the_interferometer_is_told_to_take() -> 
 
     text = asyncio.run(operations.measure(SimpleNamespace(ros=SimpleNamespace(call=call))))  # type: ignore[arg-type]
     assert waits == [math.inf] and "rms beyond tilt 0.0 nm" in text
+
+
+def test_signals_are_waited_for_as_long_as_the_way_takes_and_sent_again_to_a_driver_that_lost_them() -> None:
+    asked: list[tuple[str, float, float]] = []
+
+    async def call(name: str, request: SetSignals.Request, timeout_s: float, again_s: float) -> None:
+        asked.append((name, timeout_s, again_s))
+        assert request.wait and list(request.signals) == [0.5]
+
+    snapshot = SimpleNamespace(mirror_info=MirrorInfo(), actuator_state=ActuatorState(requested=[0.1]))
+    session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=[0.5], poked=[0.1], snapshot=lambda: snapshot)
+    assert asyncio.run(operations.release(session)) == "back at the shape before"
+    assert asked == [("set_signals", math.inf, operations.AGAIN_S)] and session.base is None

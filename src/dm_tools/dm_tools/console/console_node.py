@@ -151,14 +151,17 @@ class ConsoleNode:
             bench_time=self._bench_time,
         )
 
-    async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S) -> Any:
-        """Call a service of the suite. Raises Refusal when it refused, with its sentence, or did not answer."""
+    async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S, again_s: float = math.inf) -> Any:
+        """Call a service of the suite, as `Connection.call`.
+
+        Raises Refusal when it refused, with its sentence, or did not answer.
+        """
         try:
-            return await asyncio.to_thread(self._connection.call, name, request, timeout_s)
+            return await asyncio.to_thread(self._connection.call, name, request, timeout_s, again_s)
         except DeformableMirrorError as error:
             raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 
-    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = math.inf) -> Any:
+    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
         """Run an action to its end and return its result.
 
         Raises Refusal with the node's sentence when the goal was refused, ended with an error or was cancelled.
@@ -171,7 +174,7 @@ class ConsoleNode:
         self._stops[name] = stop
         try:
             return await asyncio.to_thread(
-                self._connection.run_action, name, goal, on_feedback, timeout_s, stop.is_set, identity
+                self._connection.run_action, name, goal, on_feedback, math.inf, stop.is_set, identity
             )
         except DeformableMirrorError as error:
             if error.response is not None:

@@ -24,8 +24,9 @@ PLANS = {
     Calibrate.Goal.PLAN_SURFACES: "Surfaces of Table 1 only",
     Calibrate.Goal.PLAN_POKE_CHECK: "Poke check: wiring and orientation, nothing is stored",
 }
-#: Longest wait, s of wall time; for a map, a degauss and whatever consists of them it is the nodes' to give up.
-MOVE_S = 60.0
+#: What sets signals is sent again after so long, s: a driver just started may have lost it. How long a way, a map or a
+#: degauss may take is the nodes' to know.
+AGAIN_S = 10.0
 
 
 async def predict(session: Session, request: FocusRequest) -> str:
@@ -36,8 +37,7 @@ async def predict(session: Session, request: FocusRequest) -> str:
 
 async def move(session: Session, request: FocusRequest) -> str:
     """Take the curvature of `request`."""
-    timeout = MOVE_S if request.mode == FocusRequest.MODE_DIRECT else math.inf
-    result = await session.run("move_focus", MoveFocus.Goal(request=request), timeout)
+    result = await session.run("move_focus", MoveFocus.Goal(request=request))
     session.base = None
     return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_text(result.state)}"
 
@@ -52,7 +52,7 @@ async def converge(session: Session, request: FocusRequest) -> str:
 
 async def flatten(session: Session) -> str:
     """Make the surface flat."""
-    answer = await session.ros.call("flatten", Flatten.Request(), MOVE_S)
+    answer = await session.ros.call("flatten", Flatten.Request())
     session.base = None
     return prediction_text(answer.state)
 
@@ -84,7 +84,7 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
 async def estimate(session: Session, goal: Calibrate.Goal) -> str:
     """How long a calibration would take, and how good it would be; nothing moves."""
     goal.dry_run = True
-    return str((await session.run("calibrate", goal, MOVE_S)).message)
+    return str((await session.run("calibrate", goal)).message)
 
 
 async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
@@ -112,13 +112,18 @@ def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:
     return mirror, requested
 
 
+async def _set_signals(session: Session, signals: list[float]) -> None:
+    """Set all signals and wait until they stand. Raises Refusal."""
+    await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), math.inf, AGAIN_S)
+
+
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
     """Move one actuator away from the shape that stood before the first poke."""
     mirror, requested = _mirror_and_signals(session)
     still_poked = np.array_equal(requested, session.poked)
     base = session.base if session.base is not None and still_poked else requested
     signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
-    await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), MOVE_S)
+    await _set_signals(session, signals)
     session.base, session.poked = base, signals
     text = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
     return f"{text}. Map: {await measure(session, f'poke {actuator}')}" if then_measure else text
@@ -131,7 +136,7 @@ async def release(session: Session) -> str:
         return "nothing is poked"
     ours = np.array_equal(requested, session.poked)
     if ours:
-        await session.ros.call("set_signals", SetSignals.Request(signals=base, wait=True), MOVE_S)
+        await _set_signals(session, base)
     session.base = None
     return "back at the shape before" if ours else "the mirror was moved by somebody else since; it stays where it is"
 
@@ -161,11 +166,11 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
                 raise Refusal(ErrorCode.CANCELED, "cancelled; the actuator is back where it began")
             session.progress.step, session.progress.text = step, f"actuator {actuator} at {signal:+.2f}"
             shape = [*start[: actuator - 1], signal, *start[actuator:]]
-            await session.ros.call("set_signals", SetSignals.Request(signals=shape, wait=True), MOVE_S)
+            await _set_signals(session, shape)
             after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), math.inf)).samples
             values.append(first + effective_change(before, after, calibration, actuator))
     except (Refusal, ValueError):
-        await session.ros.call("set_signals", SetSignals.Request(signals=start, wait=True), MOVE_S)
+        await _set_signals(session, start)
         raise
     loop = modelled_loop(observer.law, actuator, mirror.signal_min, mirror.signal_max)
     session.loops[calibration.id, actuator] = dataclasses.replace(

@@ -1,7 +1,6 @@
 """What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
 
 import asyncio
-import math
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -169,9 +168,9 @@ class Session:
         finally:
             self.progress = Progress()
 
-    async def run(self, action: str, goal: Any, timeout_s: float = math.inf) -> Any:
+    async def run(self, action: str, goal: Any) -> Any:
         """Run an action to its end, with its progress shown, and return its result. Raises Refusal."""
-        return await self.ros.run(action, goal, lambda feedback: self.progress.take(action, feedback, goal), timeout_s)
+        return await self.ros.run(action, goal, lambda feedback: self.progress.take(action, feedback, goal))
 
     async def cancel(self) -> None:
         """Ask the operation under way to stop, here or elsewhere."""
