@@ -360,8 +360,8 @@ def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(benc
 def test_a_run_ends_soon_after_the_driver_has_died(bench: Bench, action: str, goal: Any) -> None:
     running = Running(bench.client, action, goal)
     wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
-    # Killed while it tells its state, it takes a lock in shared memory with it (eProsima/Fast-DDS#5469), and nobody
-    # hears anything for seconds.
+    # Killed while it tells its state, it takes a lock in shared memory with it, as it seems (eProsima/Fast-DDS#5469):
+    # nobody hears anything for seconds.
     time.sleep(0.05)
     bench.kill_and_name(running, "pdm_driver")
     began = time.monotonic()
