@@ -172,7 +172,7 @@ class DeformableMirrorClient(Connection):
     ) -> SetSignals.Response:
         """Set all actuator signals (normalised, -1..+1); with `wait` return when they stand."""
         request = filled(SetSignals.Request, signals=signals, wait=wait, **claim)
-        return self.call("set_signals", request, math.inf if wait else None, again_s=self._timeout_s)
+        return self.call("set_signals", request, math.inf if wait else None, again=True)
 
     def degauss(
         self,

@@ -195,13 +195,15 @@ class Connection:
             raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
         return found
 
-    def call(self, name: str, request: Any, timeout_s: float | None = None, again_s: float = math.inf) -> Any:
+    def call(self, name: str, request: Any, timeout_s: float | None = None, again: bool = False) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer.
 
-        A node just started may lose a request: one that may be carried out twice is sent again after `again_s`.
+        A node just started may lose a request: with `again`, for one that may be carried out twice, it is sent again
+        once an answer is late that should come at once.
         """
         with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
+            again_s = self._timeout_s if again else math.inf
             cancelled, ready_s = (lambda: bool(gone())), self._timeout_s
             response = call(self.clients[name], request, timeout_s, cancelled, again_s, ready_s=ready_s)
         return checked(response)

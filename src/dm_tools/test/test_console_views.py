@@ -615,13 +615,13 @@ def test_a_map_is_waited_for_as_long_as_the_interferometer_is_told_to_take() -> 
 
 
 def test_signals_are_waited_for_as_long_as_the_way_takes_and_sent_again_to_a_driver_that_lost_them() -> None:
-    asked: list[tuple[str, float, float]] = []
+    asked: list[tuple[str, float, bool]] = []
 
-    async def call(name: str, request: SetSignals.Request, timeout_s: float, again_s: float) -> None:
-        asked.append((name, timeout_s, again_s))
+    async def call(name: str, request: SetSignals.Request, timeout_s: float, again: bool) -> None:
+        asked.append((name, timeout_s, again))
         assert request.wait and list(request.signals) == [0.5]
 
     snapshot = SimpleNamespace(mirror_info=MirrorInfo(), actuator_state=ActuatorState(requested=[0.1]))
     session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=[0.5], poked=[0.1], snapshot=lambda: snapshot)
     assert asyncio.run(operations.release(session)) == "back at the shape before"
-    assert asked == [("set_signals", math.inf, operations.AGAIN_S)] and session.base is None
+    assert asked == [("set_signals", math.inf, True)] and session.base is None

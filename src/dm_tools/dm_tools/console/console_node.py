@@ -151,13 +151,13 @@ class ConsoleNode:
             bench_time=self._bench_time,
         )
 
-    async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S, again_s: float = math.inf) -> Any:
+    async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S, again: bool = False) -> Any:
         """Call a service of the suite, as `Connection.call`.
 
         Raises Refusal when it refused, with its sentence, or did not answer.
         """
         try:
-            return await asyncio.to_thread(self._connection.call, name, request, timeout_s, again_s)
+            return await asyncio.to_thread(self._connection.call, name, request, timeout_s, again)
         except DeformableMirrorError as error:
             raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 

@@ -24,9 +24,6 @@ PLANS = {
     Calibrate.Goal.PLAN_SURFACES: "Surfaces of Table 1 only",
     Calibrate.Goal.PLAN_POKE_CHECK: "Poke check: wiring and orientation, nothing is stored",
 }
-#: What sets signals is sent again after so long, s: a driver just started may have lost it. How long a way, a map or a
-#: degauss may take is the nodes' to know.
-AGAIN_S = 10.0
 
 
 async def predict(session: Session, request: FocusRequest) -> str:
@@ -113,8 +110,8 @@ def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:
 
 
 async def _set_signals(session: Session, signals: list[float]) -> None:
-    """Set all signals and wait until they stand. Raises Refusal."""
-    await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), math.inf, AGAIN_S)
+    """Set all signals and wait until they stand, as long as the way takes. Raises Refusal."""
+    await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), math.inf, again=True)
 
 
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
