@@ -312,6 +312,10 @@ def build_workspace() -> None:
         return
     check_tools()
     BUILD_STAMP.unlink(missing_ok=True)  # when this is interrupted, nothing is ready for the sources of before either
+    for folder in ("build", "install"):  # links to files that were moved, renamed or removed: setuptools stops at them
+        for link in (ROOT / folder).rglob("*"):
+            if link.is_symlink() and not link.exists():
+                link.unlink()
     cmake = ["-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"] + ([] if sourced_jazzy() else ["-GNinja"])
     # By itself colcon lets a build wait for as long as the machine is busy with anything else.
     environment = {"MAKEFLAGS": f"-j{os.cpu_count() or 1}", **wheel_environment()}
@@ -321,9 +325,6 @@ def build_workspace() -> None:
         "building the workspace",
         environment,
     )
-    for link in (ROOT / "install").rglob("*"):  # of files that were moved or renamed
-        if link.is_symlink() and not link.exists():
-            link.unlink()
     BUILD_STAMP.write_text(json.dumps({"key": key, "environment": captured_environment()}))
 
 

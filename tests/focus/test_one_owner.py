@@ -332,6 +332,12 @@ def test_the_others_go_on_when_it_is_back(bench: Bench, node: str, asked: str) -
     assert bench.client.wait(bench.all_serve, 60.0)
 
 
+def test_only_nodes_with_images_share_memory(bench: Bench) -> None:
+    """A process that is killed while it sends through shared memory takes a lock with it, and others stand still."""
+    sharing = {node for node, pid in bench.suite.pids.items() if "/fastrtps_" in Path(f"/proc/{pid}/maps").read_text()}
+    assert sharing == {"virtual_bench", "autofocus"}
+
+
 def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(bench: Bench) -> None:
     running = Running(bench.client, "converge", Converge.Goal(tolerance=1e-10, max_maps=50))
     running.wait_for(lambda feedback: feedback.step > 0)
@@ -360,9 +366,6 @@ def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(benc
 def test_a_run_ends_soon_after_the_driver_has_died(bench: Bench, action: str, goal: Any) -> None:
     running = Running(bench.client, action, goal)
     wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
-    # Killed while it tells its state, it takes a lock in shared memory with it, as it seems (eProsima/Fast-DDS#5469):
-    # nobody hears anything for seconds.
-    time.sleep(0.05)
     bench.kill_and_name(running, "pdm_driver")
     began = time.monotonic()
     assert running.end().error_code == ErrorCode.DRIVER_UNAVAILABLE

@@ -253,7 +253,10 @@ def test_what_is_interrupted_or_from_elsewhere_is_not_taken_for_ready(tmp_path: 
     stamp.write_text(stamp.read_text()[:40])
     assert not names["workspace_is_ready"]()
 
+    (built / "of_a_file_that_was_renamed.yaml").symlink_to(checkout / "src" / "nothing.yaml")
+
     def interrupted(*_arguments: Any) -> None:
+        assert not any(built.rglob("*")), "setuptools stops at a link to nothing"
         raise KeyboardInterrupt
 
     names |= {"run_logged": interrupted, "check_tools": lambda: None}

@@ -161,7 +161,7 @@ class AutofocusNode(ManagedNode):
 
 def main() -> int:
     """Entry point of the node."""
-    return run_node(AutofocusNode)
+    return run_node(AutofocusNode, images=True)
 
 
 if __name__ == "__main__":

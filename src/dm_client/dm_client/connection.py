@@ -234,7 +234,7 @@ class Connection:
                 failed.append(error)
 
         try:
-            with self._answered(name, qos.RUN_SURE_S) as gone:
+            with self._answered(name) as gone:
                 result = run_goal(
                     self.clients[name],
                     goal,
@@ -251,11 +251,8 @@ class Connection:
         return checked(result)
 
     @contextmanager
-    def _answered(self, name: str, sure_s: float = qos.SURE_S) -> Iterator[Callable[[], str]]:
-        """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now.
-
-        `sure_s` as of `Liveliness.missing`.
-        """
+    def _answered(self, name: str) -> Iterator[Callable[[], str]]:
+        """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
         self._check_open()
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
@@ -263,7 +260,7 @@ class Connection:
         server = self._servers.get(name)  # None of a client that its user has added
         if server is not None:
             server.wait_for_return()
-        lost = server.since_now(sure_s=sure_s) if server is not None else lambda: ""
+        lost = server.since_now() if server is not None else lambda: ""
 
         def gone() -> str:
             return CLOSED if self._closed else lost()

@@ -56,7 +56,7 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     heard, feedback = list[int](), list[str]()
     server = SimpleNamespace(
-        heard=lambda: heard.append(len(feedback)), wait_for_return=lambda: None, since_now=lambda **_: lambda: ""
+        heard=lambda: heard.append(len(feedback)), wait_for_return=lambda: None, since_now=lambda: lambda: ""
     )
     asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
 
@@ -72,7 +72,7 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     """rclpy's executor ends the whole process with it."""
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
-    server = SimpleNamespace(heard=lambda: None, wait_for_return=lambda: None, since_now=lambda **_: lambda: "")
+    server = SimpleNamespace(heard=lambda: None, wait_for_return=lambda: None, since_now=lambda: lambda: "")
     asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
     cancelled = list[bool]()
 

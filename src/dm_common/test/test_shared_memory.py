@@ -1,7 +1,8 @@
-"""Segments of killed nodes are removed, those of living ones are not."""
+"""Nodes do without shared memory; segments of killed ones are removed, those of living ones are not."""
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -9,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dm_common.ros.executor import SHARED_MEMORY, remove_orphaned_segments
+import pytest
+
+from dm_common.ros.shared_memory import PROFILE, RANGE, SHARED_MEMORY, remove_orphaned_segments, use_udp_alone
 
 NODE = "import rclpy; rclpy.init(domain_id={}); node = rclpy.create_node('a'); print('ready', flush=True); input()"
 OWN_LOCK = re.compile("fastrtps_[0-9a-f]{16}_el")
@@ -40,3 +43,30 @@ def test_segments_go_after_their_process_was_killed(domain: int) -> None:
         assert all(segment.exists() for segment in segments)
         remove_orphaned_segments(0.0)
         assert not any(segment.exists() or segment.with_name(f"{segment.name}_el").exists() for segment in segments)
+
+
+@pytest.mark.parametrize(
+    ("given", "reach", "profile", "alone"),
+    [
+        ("LOCALHOST", "SYSTEM_DEFAULT", "fastdds.xml", "fastdds_udp_local.xml"),
+        ("SUBNET", "SUBNET", "fastdds.xml", "fastdds_udp.xml"),
+        ("LOCALHOST", "LOCALHOST", "of_the_user.xml", "of_the_user.xml"),
+    ],
+)
+def test_a_process_takes_the_profile_without_shared_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, reach: str, profile: str, alone: str
+) -> None:
+    for name in (profile, "fastdds_udp.xml", "fastdds_udp_local.xml"):
+        (tmp_path / name).touch()
+    monkeypatch.setenv(PROFILE, str(tmp_path / profile))
+    monkeypatch.setenv(RANGE, given)
+    use_udp_alone()
+    assert (os.environ[RANGE], os.environ[PROFILE]) == (reach, str(tmp_path / alone))
+
+
+@pytest.mark.parametrize("profile", ["", "/nowhere/fastdds.xml"])
+def test_without_the_profiles_of_the_suite_all_stays(monkeypatch: pytest.MonkeyPatch, profile: str) -> None:
+    monkeypatch.setenv(PROFILE, profile)
+    monkeypatch.setenv(RANGE, "LOCALHOST")
+    use_udp_alone()
+    assert (os.environ[RANGE], os.environ[PROFILE]) == ("LOCALHOST", profile)

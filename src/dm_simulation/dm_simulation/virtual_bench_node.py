@@ -197,7 +197,7 @@ class VirtualBenchNode(Node):
 
 def main() -> int:
     """Entry point of the executable `virtual_bench`."""
-    return run_node(VirtualBenchNode)
+    return run_node(VirtualBenchNode, images=True)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ with care (measured with rclpy 7.1.6):
   turns SIGINT and SIGTERM into an orderly end instead.
 """
 
-import fcntl
 import gc
 import os
 import signal
@@ -30,7 +29,6 @@ import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -50,8 +48,6 @@ from dm_common.ros import SUPERVISOR
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 #: Longest time the loop sleeps without an event; only bounds the reaction to a shutdown from another thread.
 WAKE_PERIOD_S = 1.0
-#: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
-SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 #: An answer that took so long to send was dropped, s; others take less than a millisecond.
 DROPPED_S = 0.09
 #: After how long it is sent again, s, each counted from the one before. Each try stops the process for a tenth of a
@@ -174,26 +170,10 @@ def destroy(node: Node) -> None:
     node.destroy_node()
 
 
-def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
-    """Remove Fast DDS segments whose process is gone.
-
-    Fast DDS removes its segment (17 MB a node, see config/fastdds.xml of dm_bringup) when a node ends, never after it
-    was killed, and memory runs out after some hundred kills. The owner of the segment `fastrtps_ID` holds a lock on
-    the file `fastrtps_ID_el` as long as it lives. Ports, by number, are taken over by Fast DDS itself.
-    """
-    for lock in SHARED_MEMORY.glob("fastrtps_*_el"):
-        if lock.name.startswith("fastrtps_port"):
-            continue
-        # Locked, somebody else's, or removed by another node at this moment: left alone.
-        with suppress(OSError), lock.open("r+b") as handle:
-            if time.time() - lock.stat().st_mtime >= least_age_s:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                lock.with_name(lock.name.removesuffix("_el")).unlink(missing_ok=True)
-                lock.unlink()
-
-
-def run_node(make_node: Callable[[], Node]) -> int:
+def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
     """Run one node as a process: `main()` of every node calls this.
+
+    Shared memory is for one that sends or hears `images`; others do without (`shared_memory.use_udp_alone`).
 
     The node's `make_safe()`, if it has one, runs after the loop has ended and before anything is destroyed, with SIGINT
     and SIGTERM ignored, so that a second Ctrl-C cannot interrupt the way to the safe shape.
@@ -207,7 +187,12 @@ def run_node(make_node: Callable[[], Node]) -> int:
     executor: Executor | None = None
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # whoever started this may have kept them back until now
-        remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
+        # A process only: whoever imports a node has no use for these.
+        from dm_common.ros import shared_memory, stall
+
+        shared_memory.remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
+        if not images:
+            shared_memory.use_udp_alone()
         try:
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:  # of rcl: an argument, or a parameter file, that it cannot read
@@ -215,8 +200,6 @@ def run_node(make_node: Callable[[], Node]) -> int:
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals(executor)
-        from dm_common.ros import stall  # a process only: whoever imports a node has no use for it
-
         stall.watch()
         # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()

@@ -35,11 +35,9 @@ MAP = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 #: A publisher whose process does not say for so long that it lives counts as dead, s.
 LEASE_S = 1.0
-#: A node counts as dead once it has been lost for so long, s: a machine that stalls loses all nodes for a moment.
+#: A run that may have taken hours is not given up for a node before it has been lost for so long, s: a machine that
+#: stalls loses all nodes for a moment.
 SURE_S = 0.7
-#: The same for a client whose run the node carries out, perhaps for hours, s: when another node is killed, messages of
-#: those that live have stood still for 2.3 s (measured).
-RUN_SURE_S = 5.0
 #: A node that has not appeared for so long after the one that watches it was started is missing, s.
 APPEAR_S = 5.0
 #: A node that was started again is known to one process sooner than to another, up to seconds on a busy machine: a call
@@ -109,14 +107,14 @@ class Liveliness:
                 return
             time.sleep(0.02)
 
-    def missing(self, served: Callable[[], bool] = lambda: True, sure_s: float = SURE_S) -> bool:
+    def missing(self, served: Callable[[], bool] = lambda: True) -> bool:
         """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for.
 
-        Without that, one that never came is not missing. It is lost after `sure_s`.
+        Without that, one that never came is not missing.
         """
         now = time.monotonic()
         if self.lost:
-            return now - self._changed_at > sure_s and now - self._heard_at > LEASE_S
+            return now - self._changed_at > SURE_S and now - self._heard_at > LEASE_S
         return not self.starts and now - self._born > APPEAR_S and not served()
 
     def changed_within(self, duration_s: float) -> bool:
@@ -128,10 +126,8 @@ class Liveliness:
         """What became of a node that is missing, and what to do."""
         return f"the node {self.name} {GONE if self.starts else 'is not running: start it'}"
 
-    def since_now(self, served: Callable[[], bool] = lambda: True, sure_s: float = SURE_S) -> Callable[[], str]:
+    def since_now(self, served: Callable[[], bool] = lambda: True) -> Callable[[], str]:
         """What says whether the node is missing, or was started anew since this call: then no answer comes any more.
-
-        Arguments as of `missing`.
 
         It returns what became of the node and what to do, as a sentence; "" = it may answer.
         """
@@ -140,7 +136,7 @@ class Liveliness:
         def gone() -> str:
             if self.starts > starts:
                 return f"the node {self.name} was restarted meanwhile: ask again"
-            return self.text if self.missing(served, sure_s) else ""
+            return self.text if self.missing(served) else ""
 
         return gone
 

@@ -1,0 +1,44 @@
+"""Fast DDS and the shared memory of this machine: which processes use it, and what killed ones leave there."""
+
+import fcntl
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
+#: What names the Fast DDS profile, and how far nodes look for each other.
+PROFILE, RANGE = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+#: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
+SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
+
+
+def use_udp_alone() -> None:
+    """Let this process do without shared memory: by one of the profiles for that, beside the one of the suite.
+
+    To be called before ROS is initialised. A profile of the user stays. With LOCALHOST, rmw_fastrtps would add shared
+    memory to any profile: one that is kept to the machine by itself stands for it.
+    """
+    profile, local = Path(os.environ.get(PROFILE) or "none"), os.environ.get(RANGE) == "LOCALHOST"
+    alone = profile.with_name("fastdds_udp_local.xml" if local else "fastdds_udp.xml")
+    if profile.name == "fastdds.xml" and alone.is_file():
+        os.environ[PROFILE] = str(alone)
+        if local:
+            os.environ[RANGE] = "SYSTEM_DEFAULT"
+
+
+def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
+    """Remove Fast DDS segments whose process is gone.
+
+    Fast DDS removes its segment (17 MB, see config/fastdds.xml of dm_bringup) when a node ends, never after it
+    was killed, and memory runs out after some hundred kills. The owner of the segment `fastrtps_ID` holds a lock on
+    the file `fastrtps_ID_el` as long as it lives. Ports, by number, are taken over by Fast DDS itself.
+    """
+    for lock in SHARED_MEMORY.glob("fastrtps_*_el"):
+        if lock.name.startswith("fastrtps_port"):
+            continue
+        # Locked, somebody else's, or removed by another node at this moment: left alone.
+        with suppress(OSError), lock.open("r+b") as handle:
+            if time.time() - lock.stat().st_mtime >= least_age_s:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock.with_name(lock.name.removesuffix("_el")).unlink(missing_ok=True)
+                lock.unlink()
