@@ -32,13 +32,11 @@ def alike(actuators: int, spread: float) -> tuple[float, float]:
     return own, own / (actuators + spread**2)
 
 
-def weights_of(
-    features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float], begin: Floats
-) -> Floats:
+def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[float, float], begin: Floats) -> Floats:
     """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
 
-    Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
-    own I - common 1 1'. Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
+    The inverse of their prior covariance over actuators is own I - common 1 1'; features do not depend on each other.
+    Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
 
     Args:
         between: own, common.
@@ -46,9 +44,7 @@ def weights_of(
     """
     own, common = between
     count, actuators = features.shape[1:]
-    # Of unknowns u with w = root u, whose prior is 1.
-    columns = np.ascontiguousarray(features.transpose(2, 0, 1)) @ root
-    rows = np.ascontiguousarray(columns.transpose(0, 2, 1))
+    columns, rows = (np.ascontiguousarray(features.transpose(axes)) for axes in ((2, 0, 1), (2, 1, 0)))
     seen = gains @ gains.T
     alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
     together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
@@ -66,25 +62,24 @@ def weights_of(
     shape = (right.size, right.size)
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
     tolerance = {_RELATIVE: SOLVED, "atol": 0.0}
-    first = np.linalg.solve(root, begin).T.ravel()
-    unknown, _ = cg(LinearOperator(shape, normal, dtype=np.float64), right, first, M=preconditioner, **tolerance)
-    return np.asarray(root @ unknown.reshape(actuators, count).T)
+    operator = LinearOperator(shape, normal, dtype=np.float64)
+    weights, _ = cg(operator, right, begin.T.ravel(), M=preconditioner, **tolerance)
+    return np.asarray(weights.reshape(actuators, count).T)
 
 
-def likeliest_spread(features: Floats, left: Floats, gains: Floats, root: Floats, weights: Floats) -> float:
+def likeliest_spread(features: Floats, left: Floats, gains: Floats, weights: Floats) -> float:
     """Which of SPREADS makes `left` likeliest, whatever the weights are ("evidence" in [39]).
 
     Args:
-        features, left, gains, root: as :func:`weights_of`; `left` in standard deviations.
+        features, left, gains: as :func:`weights_of`; `left` in standard deviations.
         weights: (F, N) so far: those of actuators that are not asked stay.
     """
     asked = np.arange(features.shape[2]) % -(-features.shape[2] // ASKED) == 0
     left = left - np.einsum("mfn,fn->mn", features[..., ~asked], weights[:, ~asked]) @ gains[~asked]
     features, gains = features[..., asked], gains[asked]
     count, actuators = features.shape[1:]
-    columns = np.einsum("mfn,fg->mng", features, root, optimize=True)
-    right = np.einsum("mng,mn->ng", columns, left @ gains.T).ravel()
-    flat = columns.reshape(len(left), -1)
+    right = np.einsum("mfn,mn->nf", features, left @ gains.T).ravel()
+    flat = features.transpose(0, 2, 1).reshape(len(left), -1)
     shown = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count)))
 
     def evidence(spread: float) -> float:

@@ -1,7 +1,5 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from dm_common import Floats
@@ -28,6 +26,8 @@ LOADING = 0.3
 DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
 #: The step for derivatives by them, and their largest change.
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
+#: Rows that creep is found for at a time.
+BLOCK = 32
 
 
 def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
@@ -123,41 +123,50 @@ def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
     return slope
 
 
-def creep_lags(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Iterator[Floats]:
-    """How far the creep elements lag behind `values` (M, ...) at each `time` (M,) s; all before `start` was 0.
-
-    Args:
-        moved: (M,) s, when each row began to stand, between the measurements; None = right after the one before.
-
-    Yields:
-        (J, ...), a row after the other: one array, which the next row changes.
-    """
+def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
+    """(M, J, ...) what the creep elements have followed of `values` (M, ...) at each `time`; see :func:`crept`."""
     shape = (len(CREEP_TIMES), *(1,) * (values.ndim - 1))
-    moved = np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
+    moved = _moved(time, start, moved)
     still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
     lag, before = np.zeros((len(CREEP_TIMES), *values.shape[1:])), np.zeros(values.shape[1:])
-    for now, until_move, since in zip(values, still[::2], still[1::2], strict=True):
+    states = np.empty((len(values), *lag.shape))
+    for state, now, until_move, since in zip(states, values, still[::2], still[1::2], strict=True):
         lag *= (until_move * since).reshape(shape)
         lag += since.reshape(shape) * (now - before)
-        yield lag
+        np.subtract(now, lag, out=state)
         before = now
-
-
-def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
-    """(M, J, ...) what the creep elements have followed of `values`; see :func:`creep_lags`."""
-    return np.stack([now - lag for now, lag in zip(values, creep_lags(values, time, start, moved), strict=True)])
+    return states
 
 
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None, weight: Floats = EVEN) -> Floats:
-    """What creep adds to features (M, ...); see :func:`creep_lags`.
+    """What creep adds to features (M, ...) at each `time` (M,) s; all before `start` was 0.
+
+    An element has followed all but its lag, the sum over moves of their sizes times exp(-age / time constant).
 
     Args:
-        weight: (J, ...) of the creep elements; of an even spectrum, per unit of creep rate, where not given.
+        moved: (M,) s, when each row began to stand, between the measurements; None = right after the one before.
+        weight: (J,) of the creep elements, or (J, N) of each actuator, the last axis of the features; of an even
+            spectrum, per unit of creep rate, where not given.
     """
-    result = weight.sum(axis=0) * features
-    for row, lag in enumerate(creep_lags(features, time, start, moved)):
-        result[row] -= np.einsum("j...,j...->...", weight, lag)
-    return result
+    share = weight.reshape(len(CREEP_TIMES), -1).T
+    values = features.reshape(len(features), -1, len(share))
+    moves = np.ascontiguousarray(np.diff(values, axis=0, prepend=np.zeros_like(values[:1])).transpose(2, 0, 1))
+    moved, last = _moved(time, start, moved), start
+    lag, lags = np.zeros((len(share), len(CREEP_TIMES), moves.shape[2])), np.empty_like(moves)
+    for first in range(0, len(time), BLOCK):
+        rows = slice(first, first + BLOCK)
+        age = np.maximum(time[rows, None] - moved[rows], 0.0)
+        young = np.tril(np.exp(-age / CREEP_TIMES[:, None, None]))
+        old = np.exp((last - time[rows, None]) / CREEP_TIMES)
+        lags[:, rows] = (share[:, None] * old) @ lag + np.tensordot(share, young, 1) @ moves[:, rows]
+        lag = old[-1, :, None] * lag + young[:, -1] @ moves[:, rows]
+        last = time[rows][-1]
+    return (share.sum(axis=1) * values - lags.transpose(1, 2, 0)).reshape(features.shape)
+
+
+def _moved(time: Floats, start: float, moved: Floats | None) -> Floats:
+    """(M,) s, when each row began to stand; see :func:`crept`."""
+    return np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
 
 
 def weight_of(rate: float) -> float:

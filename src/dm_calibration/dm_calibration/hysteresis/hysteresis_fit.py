@@ -165,7 +165,7 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     known = slice(1 + effective.shape[1])
     free, gains = basis_of(design[:, known]), solution[known][1:] / scatter
     unknown, left = without(fading[keep], free), without(values / scatter, free)
-    return weights_of(unknown, left, gains, np.eye(fading.shape[1]), (1.0, 0.0), np.zeros(fading.shape[1:]))
+    return weights_of(unknown, left, gains, (1.0, 0.0), np.zeros(fading.shape[1:]))
 
 
 def unknown_history_sigma(law: HysteresisModel, low: float, high: float) -> float:

@@ -208,9 +208,9 @@ class OwnLaws:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after some solutions in turn."""
         sigma = np.full(features.shape[1], DUHEM_CHANGE)
         sigma[: self._linear.stop + 1] = DUHEM_WEIGHT
-        sigma[self._linear], sigma[self._patterned] = FADING_WEIGHT, 1.0
-        root = np.diag(sigma[1:])
+        sigma[self._linear], sigma[self._patterned], sigma[0] = FADING_WEIGHT, 1.0, 1.0
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
+        features, patterns = features * sigma[:, None], patterns / sigma[:, None]  # in units of their prior
         free = basis_of(self.run.figure[keep])
         crept = self._with_creep(features, creep, patterns)
         gains, residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)
@@ -218,13 +218,13 @@ class OwnLaws:
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
             ask = self.spread is None and number == self._rounds_needed // 2 and len(free) >= ASKED_MAPS * len(gains)
-            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, root, ask)
+            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, ask)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
                 crept = self._with_creep(features, creep, patterns)
             gains, residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)
-        return patterns, creep, scatter, residual
+        return patterns * sigma[:, None], creep, scatter, residual
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
         """The law of the weights (F, N) and (J + L + 1, N)."""
@@ -260,7 +260,7 @@ class OwnLaws:
             return features
         loops = creep[ELEMENTS].copy()
         loops[:LAGS] += creep[LAGGED]
-        added = self.run.crept(features, loops[:, None])
+        added = self.run.crept(features, loops)
         added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[ELEMENTS])
         slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
         return features * (1.0 + slope[:, None]) + added
@@ -273,14 +273,13 @@ class OwnLaws:
         return self.run.responses.scatter(size)
 
     def _patterns(
-        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats, ask: bool
+        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, ask: bool
     ) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior. `ask` for how far actuators differ."""
         left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
         if ask:
-            self.spread = likeliest_spread(features, left, gains, root, begin[1:])
-        between = alike(features.shape[2], self.spread or SPREAD)
-        solved = weights_of(features, left, gains, root, between, begin[1:])
+            self.spread = likeliest_spread(features, left, gains, begin[1:])
+        solved = weights_of(features, left, gains, alike(features.shape[2], self.spread or SPREAD), begin[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
@@ -293,8 +292,9 @@ class OwnLaws:
         sloped = position * np.einsum("mjn,jn->mn", elements, creep[:-1])
         elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
         left = measured - (position[keep] + self._creep * elements[:, ELEMENTS].sum(axis=1)) @ gains
-        elements, left = without(elements, free), without(left, free)
         expected = np.zeros_like(creep)
         expected[ELEMENTS] = self._creep
-        begin = creep - expected
-        return expected + weights_of(elements, left, gains, self._creep_root, self._creep_between, begin)
+        root = self._creep_root
+        elements = without(root.T @ elements, free)  # in units of their prior
+        begin = np.asarray(np.linalg.solve(root, creep - expected), dtype=np.float64)
+        return expected + root @ weights_of(elements, without(left, free), gains, self._creep_between, begin)
