@@ -158,8 +158,7 @@ def regress_surface_errors(
     names, candidates = _candidates(maps, fit, errors, test, reading)
     if options is None and reading is Reading.LINEAR:
         options = SelectionOptions()
-    found = regress(_some(errors, ~test), names, candidates[~test], fit.method, options)
-    fitted = found.fit
+    fitted, held_out_rms = regress(_some(errors, ~test), names, candidates[~test], fit.method, options)
     residual = errors.response[~test] - fitted.predict(candidates[~test])[0]
     actual = errors.response[test]
     mean, lower, upper = fitted.predict(candidates[test]) if len(actual) else (actual, actual, actual)
@@ -177,7 +176,7 @@ def regress_surface_errors(
         n=fitted.n,
         k=fitted.k,
         in_sample_rms=float(np.sqrt(np.mean(residual**2))),
-        leave_one_out_rms=found.leave_one_out_rms,
+        leave_one_out_rms=held_out_rms,
         test_rms=float(np.sqrt(np.mean((mean - actual) ** 2))) if len(actual) else float("nan"),
     )
     return ReadRegression(reading, names, fitted, table2, table3)

@@ -106,6 +106,17 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
 
 
+def test_creep_of_before_is_found_though_each_wrong_map_hides_the_next() -> None:
+    """More of them than there are rounds."""
+    rng = np.random.default_rng(6)
+    effective, noise = rng.standard_normal((120, 3)), rng.standard_normal((120, 5))
+    fading = np.exp(-np.linspace(0.0, 3.0, 120))[:, None, None] * np.ones(3)
+    values = 1e-6 * (effective + 0.5 * fading[:, 0]) @ rng.standard_normal((3, 5)) + 1e-9 * noise
+    values[20:25] += 1e-7 * 12.0 ** np.arange(hysteresis_fit.OUTLIER_ROUNDS + 1)[:, None]
+    responses = Responses(values, 5, np.ones(120, dtype=bool))
+    np.testing.assert_allclose(hysteresis_fit._crept_before(responses, effective, fading), 0.5, atol=0.1)
+
+
 @pytest.mark.parametrize("low", [-1.0, -0.5])
 def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to(low: float) -> None:
     """Creep of before the run fades as fast in the one as in the other, with a spectrum of each actuator's own too."""

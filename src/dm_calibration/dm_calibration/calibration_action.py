@@ -1,6 +1,5 @@
 """The body of the action `calibrate`: goal to plan, run, fit, store, publish."""
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -26,9 +25,6 @@ from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
-
-#: Least time between two feedback messages of one phase, s.
-FEEDBACK_PERIOD_S = 0.1
 
 _PHASES = {
     StepKind.POKE: "pokes",
@@ -60,7 +56,7 @@ class CalibrateAction:
         self._driver_facts, self._handle, self._goal = driver_facts, handle, handle.request
         self._maps_per_state = self._goal.maps_per_state or 1
         self._result = without_figures(Calibrate.Result())
-        self._feedback, self._sent, self._end = Calibrate.Feedback(), -FEEDBACK_PERIOD_S, 0
+        self._feedback, self._end = Calibrate.Feedback(), 0
 
     def run(self) -> tuple[str, Calibrate.Result]:
         """Carry the goal out; returns how it ended, and the result."""
@@ -204,14 +200,11 @@ class CalibrateAction:
 
     def _report(self, phase: str, label: str, step: int) -> None:
         feedback = self._feedback
-        new = phase != feedback.phase
         feedback.phase, feedback.label, feedback.step = phase, label, step
         left = self._plan.steps[step : self._end]
         feedback.maps_left = sum(each.takes_map for each in left)
         feedback.time_left = float(step_times(left, self._services.settle_time, self._services.map_time).sum())
-        if new or time.monotonic() - self._sent >= FEEDBACK_PERIOD_S:
-            self._sent = time.monotonic()
-            self._handle.publish_feedback(feedback)
+        self._handle.publish_feedback(feedback)
 
     def _report_progress(self, now: Progress) -> None:
         self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms

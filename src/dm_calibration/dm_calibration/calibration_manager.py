@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,14 @@ from dm_common.recipes import RecipeBook, RecipeError
 
 #: A calibration whose promise is so many times that of the one it replaces is worth a warning.
 CLEARLY_WORSE = 2.0
+
+
+def becomes(condition: Callable[[], bool], patience: float) -> bool:
+    """Whether `condition` holds, now or within `patience` s of wall time."""
+    deadline = time.monotonic() + patience
+    while not (held := condition()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return held
 
 
 class CalibrationManager:
@@ -56,10 +65,8 @@ class CalibrationManager:
         Raises:
             Refusal: it is not known yet.
         """
-        deadline = time.monotonic() + wait_s
-        while (mirror := self.mirror) is None and time.monotonic() < deadline:
-            time.sleep(0.02)
-        if mirror is None:
+        becomes(lambda: self.mirror is not None, wait_s)
+        if (mirror := self.mirror) is None:
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
         return mirror
 
@@ -111,19 +118,17 @@ class CalibrationManager:
 
     def _put(self, calibration: Calibration | None) -> None:
         """Take `calibration` in use; the lock must be held."""
-        self.in_use = calibration
-        self._publish(calibration, self.store.find(calibration.id) if calibration else None)
+        self.in_use, file = calibration, None
+        if calibration is not None:
+            with suppress(UnknownNameError):  # removed meanwhile; what is in use stays
+                file = self.store.find(calibration.id)
+        self._publish(calibration, file)
 
     def publish_again(self) -> None:
         """Publish the calibration in use anew."""
         with self._lock:
-            if self.in_use is None:
-                return
-            try:
-                file = self.store.find(self.in_use.id)
-            except UnknownNameError:  # removed meanwhile; what is in use stays
-                file = None
-            self._publish(self.in_use, file)
+            if self.in_use is not None:
+                self._put(self.in_use)
 
     def load(self, name: str) -> tuple[Calibration, str]:
         """Load by id or file, or the newest that fits when `name` is empty, and use it. Returns it and what `use` does.

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,12 +158,10 @@ def calibrate(
 
 def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
     """(10,) weights for commands weighted by region; empty where the maps give none."""
-    if StepKind.SURFACE not in maps.kind:
-        return np.zeros(0)
-    try:
-        return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
-    except ValueError:  # a calibration is whole without them
-        return np.zeros(0)
+    if StepKind.SURFACE in maps.kind:
+        with suppress(ValueError):  # a calibration is whole without them
+            return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
+    return np.zeros(0)
 
 
 def fit_effective(

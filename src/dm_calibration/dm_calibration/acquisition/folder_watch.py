@@ -6,7 +6,6 @@ stillness is judged by this machine's monotonic clock.
 """
 
 import fnmatch
-import os
 import stat
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -92,13 +91,8 @@ class FolderWatch:
         """
         ready = []
         for name in names:
-            if self._known is None or name in self._ignored or not self._matches(name):
+            if self._known is None or (signature := self._signature(name)) is None:
                 continue
-            try:
-                status = (self.folder / name).stat()
-            except OSError:
-                continue
-            signature = Signature(status.st_ino, status.st_size, status.st_mtime_ns)
             candidate = self._known.get(name)
             if candidate is None or candidate.signature != signature:
                 candidate = self._known[name] = _Candidate(signature, now)
@@ -114,17 +108,18 @@ class FolderWatch:
         Raises:
             OSError: the folder cannot be read now.
         """
-        found = {}
-        with os.scandir(self.folder) as entries:
-            for entry in entries:
-                if entry.name in self._ignored or not self._matches(entry.name):
-                    continue
-                try:
-                    status = entry.stat()
-                except OSError:  # gone again, or a link to nowhere
-                    continue
-                found[entry.name] = Signature(status.st_ino, status.st_size, status.st_mtime_ns)
-        return found
+        seen = {path.name: self._signature(path.name) for path in self.folder.iterdir()}
+        return {name: signature for name, signature in seen.items() if signature is not None}
+
+    def _signature(self, name: str) -> Signature | None:
+        """Of a file that is watched for; None = of none such, or it is gone again, or a link to nowhere."""
+        if name in self._ignored or not self._matches(name):
+            return None
+        try:
+            status = (self.folder / name).stat()
+        except OSError:
+            return None
+        return Signature(status.st_ino, status.st_size, status.st_mtime_ns)
 
     def _matches(self, name: str) -> bool:
         return not name.startswith(".") and any(fnmatch.fnmatchcase(name.lower(), p) for p in self._patterns)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dm_calibration.hysteresis.features import fading_features, play_features
+from dm_calibration.hysteresis.features import play_features
 from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis
@@ -162,23 +162,19 @@ class CandidateProblem:
         features = self._plays + rate * self._plays_crept
         if not self.candidate.slopes:
             return features
-        operator = FadingHysteresis(slope)
-        fading = self.run.along(lambda signals: fading_features(signals, operator, self.run.rest))
+        fading = self.run.fading(FadingHysteresis(slope))
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:
         """Weights (F,), residual (M, D) in units of the scatter."""
-        measured, figure, kept = self._measured[keep], self.run.figure[keep], features[keep]
         if weights is None:
             weights = np.eye(features.shape[1])[0]
         if len(weights) > 1:
-            free = basis_of(figure)
-            weights = _alternate(without(kept, free), without(measured, free), weights)
-        design = np.hstack((figure, np.einsum("f,mfn->mn", weights, kept)))
-        solution = np.linalg.lstsq(design, measured, rcond=1e-10)[0]
-        design = np.hstack((self.run.figure, np.einsum("f,mfn->mn", weights, features)))
-        return weights, self._measured - design @ solution
+            free = basis_of(self.run.figure[keep])
+            weights = _alternate(without(features[keep], free), without(self._measured[keep], free), weights)
+        _, left = self.run.gains(np.einsum("f,mfn->mn", weights, features), keep)
+        return weights, left / self._scatter
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
         plays = len(self.radius) * self.candidate.powers

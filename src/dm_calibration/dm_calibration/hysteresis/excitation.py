@@ -130,10 +130,8 @@ def _random(mirror: Mirror, count: int, wide: bool, rng: np.random.Generator) ->
 
 def _gentle(mirror: Mirror, shapes: Floats) -> Floats:
     """(...,) what share of `shapes` (..., N), in half ranges, keeps neighbours near each other; at most 1."""
-    if not len(mirror.limits.pairs):
-        return np.ones(shapes.shape[:-1])
     a, b = mirror.limits.pairs.T
-    steepest = mirror.limits.half_range * np.abs(shapes[..., a] - shapes[..., b]).max(axis=-1)
+    steepest = mirror.limits.half_range * np.abs(shapes[..., a] - shapes[..., b]).max(axis=-1, initial=0.0)
     return np.asarray(np.minimum(1.0, 0.999 * mirror.limits.neighbour_difference / np.maximum(steepest, 1e-12)))
 
 

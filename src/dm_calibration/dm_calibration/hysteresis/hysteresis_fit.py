@@ -24,6 +24,8 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 #: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
 
+Rows = NDArray[np.bool_]
+
 
 @dataclass(frozen=True, eq=False)
 class HysteresisFit:
@@ -83,17 +85,22 @@ def fit_hysteresis(
     )
 
 
-def _without_outliers(run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
+def _without_outliers(run: Run, test: Rows, candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
     """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
-        size = np.linalg.norm(found.fit.residual, axis=1)
-        usable = run.responses.usable
-        outlier = usable & (size > OUTLIER * np.median(size[usable]))
-        if not outlier.any() or outlier.sum() > OUTLIERS_MAX * usable.sum():
+        agreeing = _agreeing(run.responses.usable, found.fit.residual)
+        if agreeing.sum() == run.responses.usable.sum():
             return found, run
-        run = replace(run, responses=replace(run.responses, usable=usable & ~outlier))
+        run = replace(run, responses=replace(run.responses, usable=agreeing))
     return identify(run, test, candidates), run
+
+
+def _agreeing(used: Rows, residual: Floats) -> Rows:
+    """(M,) the rows of those `used` whose `residual` (M, D) is none of an outlier; all where these are too many."""
+    size = np.linalg.norm(residual, axis=1)
+    outlier = used & (size > OUTLIER * np.median(size[used]))
+    return used if outlier.sum() > OUTLIERS_MAX * used.sum() else used & ~outlier
 
 
 def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
@@ -147,24 +154,21 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
         effective: (M, N).
         fading: (M, S, N) how much of it each map still shows.
     """
-    keep, count = responses.usable, responses.coefficients
+    agreeing, count, values = responses.usable, responses.coefficients, responses.values
     whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
     for _ in range(OUTLIER_ROUNDS):
-        design, values = whole[keep], responses.values[keep]
-        solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
-        residual = values - design @ solution
-        size = np.linalg.norm(residual, axis=1)
-        outlier = size > OUTLIER * np.median(size)
-        if not outlier.any() or outlier.sum() > OUTLIERS_MAX * len(size):
+        used = agreeing
+        solution = np.linalg.lstsq(whole[used], values[used], rcond=1e-10)[0]
+        residual = values - whole @ solution
+        agreeing = _agreeing(used, residual)
+        if agreeing.sum() == used.sum():
             break
-        keep = keep.copy()
-        keep[np.flatnonzero(keep)[outlier]] = False
-    freedom = max(len(design) - design.shape[1], 1)
-    scatter = np.sqrt(np.square(residual).sum(axis=0) / freedom)
+    freedom = max(used.sum() - whole.shape[1], 1)
+    scatter = np.sqrt(np.square(residual[used]).sum(axis=0) / freedom)
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
     known = slice(1 + effective.shape[1])
-    free, gains = basis_of(design[:, known]), solution[known][1:] / scatter
-    unknown, left = without(fading[keep], free), without(values / scatter, free)
+    free, gains = basis_of(whole[used, known]), solution[known][1:] / scatter
+    unknown, left = without(fading[used], free), without(values[used] / scatter, free)
     return weights_of(unknown, left, gains, (1.0, 0.0), np.zeros(fading.shape[1:]))
 
 

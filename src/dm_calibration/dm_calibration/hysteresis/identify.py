@@ -250,9 +250,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
 def _scatter(run: Run, keep: Rows) -> Floats:
     """(D,) uncertainty of each response, from what a rich law leaves: one value for coefficients, one per pattern."""
     responses = run.responses
-    scatter = np.ones(responses.values.shape[1])
-    scatter[: responses.coefficients] = 1e-9
-    scatter[responses.coefficients :] = 1e-8
+    scatter = np.where(np.arange(responses.values.shape[1]) < responses.coefficients, 1e-9, 1e-8)
     for _ in range(2):
         left = CandidateProblem(run, PREISACH, scatter).fit(keep, evaluations=4).residual[keep]
         # Robust: maps that no law explains must not set the scale.

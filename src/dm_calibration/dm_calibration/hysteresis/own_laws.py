@@ -27,7 +27,6 @@ from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
     PER_ELEMENT,
     fading_changes,
-    fading_features,
     own_slopes,
     padded_slope,
     pattern_basis,
@@ -124,7 +123,7 @@ class OwnLaws:
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
         if candidate.slopes:
             linear = FadingHysteresis(rates=FADING_RATE, drive=np.zeros((len(FADING_RATE), FADING_POWERS)))
-            columns.append(self._fading(linear))
+            columns.append(run.fading(linear))
         self._plain = np.concatenate(columns, axis=1)
         #: Which features are patterns of the play operators, and which linear Duhem operators.
         first = 1 + self._basis.shape[1]
@@ -192,15 +191,11 @@ class OwnLaws:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""
         if not slope.size:
             return self._plain
-        return np.concatenate((self._plain, self._fading(FadingHysteresis(slope))), axis=1)
+        return np.concatenate((self._plain, self.run.fading(FadingHysteresis(slope))), axis=1)
 
     def _changes(self, slope: Floats) -> Floats:
         """(M, 2 A, N) derivatives of the Duhem operators with `slope` (N, 2, A) by its coefficients."""
         return self.run.along(lambda signals: fading_changes(signals, slope, self.run.rest))
-
-    def _fading(self, operators: FadingHysteresis) -> Floats:
-        """(M, Z, N) values of Duhem operators along the run."""
-        return self.run.along(lambda signals: fading_features(signals, operators, self.run.rest))
 
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats

@@ -102,7 +102,6 @@ def responses_of(maps: MapSet) -> Responses:
     modes = basis(maps.points.x, maps.points.y)
     design = np.column_stack((np.ones(len(maps)), maps.applied))[usable]
     model: Floats = maps.coefficients[usable] @ modes.T
-    solution = np.zeros((0, 0))
     for _ in range(4):  # the gaps' own share shrinks to nothing in some rounds
         filled = fill_gaps(sag, model, maps.points)
         solution = np.asarray(np.linalg.lstsq(design, filled, rcond=None)[0], dtype=np.float64)

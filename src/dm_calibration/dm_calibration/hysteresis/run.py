@@ -14,10 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.features import EVEN, creep_states, crept, follow, relaxation
+from dm_calibration.hysteresis.features import EVEN, creep_states, crept, fading_features, follow, relaxation
 from dm_calibration.hysteresis.responses import Responses, responses_of
 from dm_calibration.influence.maps import BEFORE_FIRST_MAP_S, MapSet
 from dm_common import Floats
+from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import HysteresisModel
 
 #: A step of the figure is this much more likely than fading creep to explain few maps.
@@ -71,6 +72,10 @@ class Run:
         """A `feature` of signals that begin demagnetised, along the commands."""
         sequences = [rows for part, _ in self.parts for rows in self._sequences(part)]
         return np.concatenate([feature(self.signals[rows]) for rows in sequences])
+
+    def fading(self, operators: FadingHysteresis) -> Floats:
+        """(M, Z, N) values of Duhem operators along the commands."""
+        return self.along(lambda signals: fading_features(signals, operators, self.rest))
 
     def _sequences(self, part: slice) -> list[slice]:
         """The rows of a part from one degauss to the next."""

@@ -15,6 +15,7 @@ from dm_calibration.map_files.datx_structure import (
     number_in,
     object_at,
     read_heights,
+    required,
 )
 from dm_calibration.map_files.four_d import is_four_d, parse_four_d
 from dm_calibration.map_files.surface_map import (
@@ -71,9 +72,9 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     surface = object_at(file, _path(metadata, "Surface"))
     extra = _extra_attributes(file, metadata)
 
-    wavelength = check_wavelength(_required(surface, "Wavelength", _extra_number(extra, "Wavelength")))
+    wavelength = check_wavelength(required(surface, "Wavelength", _extra_number(extra, "Wavelength")))
     scale = _metres_per_unit(surface, extra, wavelength)
-    no_data = _required(surface, "No Data")
+    no_data = required(surface, "No Data")
     if not (math.isnan(no_data) or no_data >= _NO_DATA_LEAST):
         raise MapFileError(f"{surface.name}: No Data = {no_data:g}: must be NaN or at least {_NO_DATA_LEAST:g}")
     pitch = _pitch(surface, extra)
@@ -95,14 +96,6 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
         time_stamp=time_stamp if time_stamp else None,
         system_error_subtracted=_TRUTH.get(_extra_text(extra, "Subtract System Error").lower()),
     )
-
-
-def _required(surface: h5py.Dataset, name: str, *otherwise: float | None) -> float:
-    """The number in the attribute `name`, or the first that is known of `otherwise`."""
-    for value in (number_in(surface, name), *otherwise):
-        if value is not None:
-            return value
-    raise missing(surface, name)
 
 
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
@@ -163,8 +156,8 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
     if unit.lower() != "fringes":
         remark = "; the data are no height map" if unit.lower() == "nounits" else ""
         raise MapFileError(f"{surface.name}: Unit = '{unit}': must be Fringes or a length such as NanoMeters{remark}")
-    scale_factor = _required(surface, "Interferometric Scale Factor")
-    obliquity = _required(surface, "Obliquity Factor", _extra_number(extra, "Obliquity"), 1.0)
+    scale_factor = required(surface, "Interferometric Scale Factor")
+    obliquity = required(surface, "Obliquity Factor", _extra_number(extra, "Obliquity"), 1.0)
     scale_factor = check_factor("Interferometric Scale Factor", scale_factor)
     return scale_factor * check_factor("Obliquity Factor", obliquity) * wavelength
 

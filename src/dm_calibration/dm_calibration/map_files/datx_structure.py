@@ -203,6 +203,14 @@ def number_in(node: Any, name: str) -> float | None:
     return float(value[0])
 
 
+def required(node: Any, name: str, *otherwise: float | None) -> float:
+    """The number in the attribute `name`, or the first that is known of `otherwise`. Raises MapFileError."""
+    for value in (number_in(node, name), *otherwise):
+        if value is not None:
+            return value
+    raise missing(node, name)
+
+
 def as_text(value: Any) -> str:
     if isinstance(value, bytes):
         return value.decode("latin-1")

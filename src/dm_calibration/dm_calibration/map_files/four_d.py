@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.datx_structure import as_text, missing, number_in, object_at, read_heights
+from dm_calibration.map_files.datx_structure import as_text, missing, number_in, object_at, read_heights, required
 from dm_calibration.map_files.surface_map import (
     METRES,
     MapFileError,
@@ -47,10 +47,7 @@ def _newer(file: h5py.File, content: bytes) -> SurfaceMap:
     group = object_at(file, _NEW)
     if (count := number_in(group, _COUNT)) is not None:
         raise MapFileError(f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, without it")
-    nanometres = number_in(group, _WAVELENGTH)
-    if nanometres is None:
-        raise missing(group, _WAVELENGTH)
-    wavelength = check_wavelength(1e-9 * nanometres)
+    wavelength = check_wavelength(1e-9 * required(group, _WAVELENGTH))
     surface = object_at(file, f"{_NEW}/SurfaceInWaves/Data")
     return _surface_map(read_heights(surface, content, np.nan), wavelength, None, "4D")
 

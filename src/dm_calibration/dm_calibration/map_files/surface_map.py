@@ -22,9 +22,6 @@ COUNTS_PER_FRINGE = {0: 4096, 1: 32768, 2: 131072}
 #: Largest map that is read; the largest cameras of these instruments have 12 million pixels.
 MAX_PIXELS = 2**25
 
-#: Pixels converted at a time: 1 MB.
-_BLOCK_PIXELS = 2**17
-
 #: Units of length that files name, as m.
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 
@@ -102,23 +99,15 @@ class SurfaceMap:
         """(height, width), True where there is data."""
         return np.isfinite(self.sag)
 
-    @property
+    @cached_property
     def pv(self) -> float:
-        """m, peak to valley of `sag` over all its valid pixels."""
-        return self._spread[0]
-
-    @property
-    def rms(self) -> float:
-        """m, standard deviation of the same."""
-        return self._spread[1]
+        """m, peak to valley of `sag` over all its valid pixels; found when first asked for, as `rms`."""
+        return float(np.ptp(self.sag[self.valid]))
 
     @cached_property
-    def _spread(self) -> tuple[float, float]:
-        """Found when first asked for: coefficients need not wait for it."""
-        heights = self.sag[self.valid]
-        extent = float(np.ptp(heights))
-        heights -= heights.mean()
-        return extent, float(np.sqrt(heights @ heights / heights.size))
+    def rms(self) -> float:
+        """m, standard deviation of the same."""
+        return float(np.std(self.sag[self.valid]))
 
 
 def _outside(name: str, value: object, allowed: str) -> MapFileError:
@@ -213,19 +202,11 @@ def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> Flo
     Raises:
         NoValidPixelsError: every pixel is invalid.
     """
-    # In blocks of rows that stay in the processor's cache: intermediate maps would cost more than the arithmetic.
-    sag = np.empty(counts.shape)
-    rows = max(_BLOCK_PIXELS // max(counts.shape[1], 1), 1)
-    valid = 0
-    for start in range(0, len(sag), rows):
-        block = sag[start : start + rows]
-        block[...] = counts[start : start + rows]
-        invalid = block >= INVALID_COUNTS
-        valid += invalid.size - int(np.count_nonzero(invalid))
-        block *= metres_per_count
-        block[invalid] = math.nan
-    if not valid:
+    invalid = counts >= INVALID_COUNTS
+    if invalid.all():
         raise _no_valid_pixels(counts.shape)
+    sag = np.asarray(counts * metres_per_count, dtype=np.float64)
+    sag[invalid] = math.nan
     return sag
 
 

@@ -123,5 +123,4 @@ class BumpCheck:
 
 def _figure_rms(coefficients: Floats) -> float:
     """Rms sag without piston and tilt, m."""
-    terms = slice(PISTON_TILT, coefficients.size)
-    return float(np.linalg.norm(coefficients[terms] * TERM_RMS[PISTON_TILT : coefficients.size]))
+    return float(np.linalg.norm(coefficients[PISTON_TILT:] * TERM_RMS[PISTON_TILT : coefficients.size]))

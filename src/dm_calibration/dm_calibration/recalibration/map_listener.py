@@ -15,7 +15,7 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_manager import CalibrationManager
+from dm_calibration.calibration_manager import CalibrationManager, becomes
 from dm_calibration.calibration_messages import put_updates
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
@@ -37,14 +37,6 @@ REPORT_WAIT_S = 3.0
 PUBLISH_PERIOD_S = 1.0
 #: Maps of which messages are still to come, and maps remembered so that none counts twice.
 INCOMPLETE_KEPT, MAPS_KEPT = 8, 64
-
-
-def _becomes(condition: Callable[[], bool], patience: float) -> bool:
-    """Whether `condition` holds, now or within `patience` s of wall time."""
-    deadline = time.monotonic() + patience
-    while not (held := condition()) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return held
 
 
 class MapListener:
@@ -202,7 +194,7 @@ class MapListener:
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
         measured = replace(measured, temperature=self._temperatures.at(at))
-        if not _becomes(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
+        if not becomes(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
@@ -258,7 +250,7 @@ class MapListener:
                     if not (request.dry_run and refusal.error_code == ErrorCode.BUSY):
                         raise
                 # A map of a mirror that does not rest before and after is refused: corrections of creep wait so long.
-                _becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
+                becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
                 try:
                     verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])

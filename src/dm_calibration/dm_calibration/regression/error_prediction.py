@@ -41,7 +41,7 @@ class ErrorPrediction:
         with self._lock:
             predictor = self._fitted(stored, request.method or stored.fit.method, options)
             self._of, self._predictor = stored.id, predictor
-        fit, held_out = predictor.regression.fit, predictor.regression.leave_one_out_rms
+        fit, held_out = predictor.fit, predictor.held_out_rms
         response.adjusted_r2, response.f_statistic, response.p_value = fit.adjusted_r2, fit.f_statistic, fit.p_value
         response.samples = fit.n
         response.variables = list(fit.variables)

@@ -17,8 +17,8 @@ from dm_calibration.influence.quality import GRADE_NOT_EXCITED
 from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
-from dm_calibration.regression.stepwise import SelectionOptions
-from dm_calibration.regression.surface_error import ErrorRegression, model_candidates, regress, surface_errors
+from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
+from dm_calibration.regression.surface_error import model_candidates, regress, surface_errors
 from dm_common import Floats
 from dm_common.optics.piston_tilt import rms
 
@@ -34,13 +34,15 @@ class ErrorPredictor:
 
     Attributes:
         influence: the influence function that nominal surfaces come from.
-        regression: fitted to all surfaces p01-p58.
+        fit: the regression, of all surfaces p01-p58.
+        held_out_rms: of these surfaces, see :func:`~dm_calibration.regression.surface_error.regress`, m.
         sag: from commands, by all good maps.
         histories: (1 + COMMANDS, HISTORIES, N) normalised; the first is rest, for creep has died away there.
     """
 
     influence: InfluenceFit
-    regression: ErrorRegression
+    fit: StepwiseFit
+    held_out_rms: float
     sag: SagModel
     histories: Floats
 
@@ -62,11 +64,10 @@ class ErrorPredictor:
         moved = effective[-1] - model.effective(rested)
         sag = self.sag.figure[-1] + moved.reshape(count, actuators) @ self.sag.influence
         same = np.broadcast_to(signals, (count, actuators))
-        fit = self.influence
-        size = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)
-        mean, lower, upper = self.regression.fit.predict(
-            np.column_stack((size, same[:, fit.grades != GRADE_NOT_EXCITED]))
-        )
+        influence, points = self.influence, self.influence.points
+        size = rms(surface_control_error(sag, same, influence.influence_zernike, points), points.weight)
+        moving = same[:, influence.grades != GRADE_NOT_EXCITED]
+        mean, lower, upper = self.fit.predict(np.column_stack((size, moving)))
         return (
             max(float(mean.mean()), 0.0),
             max(float(np.percentile(lower, 2.5)), 0.0),
@@ -84,9 +85,9 @@ def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptio
     errors = surface_errors(maps, influence)
     history = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T)
     names, candidates = model_candidates(maps, influence, errors, history.predict)
-    regression = regress(errors, names, candidates, influence.method, options)
+    fit, held_out_rms = regress(errors, names, candidates, influence.method, options)
     histories = _histories(maps, influence, np.random.default_rng(0))
-    return ErrorPredictor(influence, regression, history.fit(influence.used), histories)
+    return ErrorPredictor(influence, fit, held_out_rms, history.fit(influence.used), histories)
 
 
 def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:

@@ -110,32 +110,23 @@ def surface_weights(errors: SurfaceErrors) -> Floats:
     return weights * np.mean(1.0 / weights)
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorRegression:
-    """A regression of the surface control error.
-
-    Attributes:
-        fit: the selected model, in m.
-        leave_one_out_rms: m, error of the surfaces, each predicted by a model selected and fitted without it.
-    """
-
-    fit: StepwiseFit
-    leave_one_out_rms: float
-
-
 def regress(
     errors: SurfaceErrors,
     names: Sequence[str],
     candidates: Floats,
     method: str,
     options: SelectionOptions | None = None,
-) -> ErrorRegression:
+) -> tuple[StepwiseFit, float]:
     """Select and fit a regression of the surface control error on `candidates` (S, C).
 
     Args:
         names: (C,) of the candidates.
         method: of the influence function; AZWreg makes the regression a weighted one.
         options: thresholds; None = those of the module's docstring.
+
+    Returns:
+        The selected model, in m, and the rms error of the surfaces, each predicted by a model selected and fitted
+        without it, m.
 
     Raises:
         TooFewMapsError: see :mod:`~dm_calibration.regression.stepwise`.
@@ -145,7 +136,7 @@ def regress(
     options = options or SelectionOptions(P_ENTER / len(names), P_REMOVE / len(names))
     fitted = stepwise(candidates, errors.response, names, weights, options)
     left_out = errors.response - leave_one_out(candidates, errors.response, weights, options)
-    return ErrorRegression(fitted, float(np.sqrt(np.mean(left_out**2))))
+    return fitted, float(np.sqrt(np.mean(left_out**2)))
 
 
 def model_candidates(

@@ -73,12 +73,7 @@ def influence(calibration: Calibration) -> Section:
 
 def residual(calibration: Calibration) -> Section:
     """Residual of each map."""
-    fit = calibration.fit
-    text = (
-        f"In-sample {fit.in_sample_rms * NM:.2f} nm, held out {fit.held_out_rms * NM:.2f} nm rms sag. Reference frames "
-        "are maps at mid range; the figure of the mirror is followed from one to the next "
-        f"({fit.drift_rms * NM:.2f} nm rms over the run)."
-    )
+    text = "Reference frames are maps at mid range; the figure of the mirror is followed from one to the next."
     drawn = figures.residual_figure(calibration)
     picture = Picture("residuals", "What the fit leaves of each map, over the run.", drawn)
     return Section("Residuals of the maps", [text], pictures=[picture])
@@ -129,8 +124,5 @@ def coefficients(calibration: Calibration, left: MapSet) -> Section:
             "Held-out moves are those of the check, predicted by a law that had not seen them; the noise of their maps "
             "is taken off, so they can lie below the in-sample figure."
         )
-    else:
-        bound = calibration.fit.held_out_max_zernike * NM
-        text += f"Held out, with what hysteresis may add, the largest stays below {bound:.2f} nm in 95 % of the maps."
     picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(rms, sigma))
     return Section("Zernike coefficients", [text], [Table("Residual by coefficient", header, rows)], [picture])

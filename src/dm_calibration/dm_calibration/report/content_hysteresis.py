@@ -108,7 +108,7 @@ def hysteresis(calibration: Calibration) -> Section:
             "calibration with the plan “hysteresis” does (./dm calibrate --plan hysteresis)."
         )
         return Section(title, [text])
-    law, bound = hysteresis.law, length(hysteresis.held_out_max_zernike, calibration.wavelength)
+    law = hysteresis.law
     seen = calibration.fit.signal_min, calibration.fit.signal_max
     openings = loop_opening(law, *seen)
     spread = f", {openings.min():.1%} to {openings.max():.1%} over the actuators" if law.actuators else ""
@@ -121,7 +121,6 @@ def hysteresis(calibration: Calibration) -> Section:
         ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
         ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
         ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),
-        ("largest coefficient error of a predicted move, held out, 95 %", bound),
         ("standard deviation of an effective signal when the history is unknown", f"{hysteresis.unknown_sigma:.3f}"),
     ]
     caption = f"Loops of the identified law: {shared}; gains are in the influence function."

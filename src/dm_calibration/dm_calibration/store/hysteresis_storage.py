@@ -14,6 +14,8 @@ from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
 #: Of each recipe, always; its added terms are kept as a table.
 _RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model"))
+#: Single numbers of the book.
+_BOOK = tuple(field.name for field in fields(RecipeBook) if field.name != "recipes")
 
 
 def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
@@ -64,10 +66,7 @@ def recipe_columns(book: RecipeBook) -> dict[str, Column]:
     columns["recipes/zernike"] = np.array([recipe.zernike or len(TERMS) * (0.0,) for recipe in book.recipes])
     known = [recipe.by_model if recipe.by_model.size else np.nan * recipe.effective for recipe in book.recipes]
     columns["recipes/by_model"] = np.array(known)
-    columns["recipes/degauss_steps"] = np.array(book.degauss_steps)
-    columns["recipes/interpolation_error"] = np.array(book.interpolation_error)
-    columns["recipes/stamp_ns"] = np.array(book.stamp_ns)
-    return columns
+    return columns | {f"recipes/{name}": np.array(getattr(book, name)) for name in _BOOK}
 
 
 def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
@@ -89,12 +88,7 @@ def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
         )
         for row, terms, own in zip(zip(*rows, strict=True), zernike, by_model, strict=True)
     )
-    return RecipeBook(
-        recipes,
-        int(np.asarray(columns["recipes/degauss_steps"])),
-        float(np.asarray(columns["recipes/interpolation_error"])),
-        int(np.asarray(columns["recipes/stamp_ns"])),
-    )
+    return RecipeBook(recipes, *(np.asarray(columns[f"recipes/{name}"]).item() for name in _BOOK))
 
 
 def _texts(columns: Mapping[str, Column], name: str) -> tuple[str, ...]:
