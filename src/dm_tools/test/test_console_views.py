@@ -625,3 +625,17 @@ def test_signals_are_waited_for_as_long_as_the_way_takes_and_sent_again_to_a_dri
     session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=[0.5], poked=[0.1], snapshot=lambda: snapshot)
     assert asyncio.run(operations.release(session)) == "back at the shape before"
     assert asked == [("set_signals", math.inf, True)] and session.base is None
+
+
+def test_a_poke_has_settled_when_its_map_is_taken() -> None:
+    asked: list[tuple[str, float]] = []
+
+    async def call(name: str, _request: Any, _timeout_s: float, again: bool = False) -> Measure.Response:
+        assert again == (name == "set_signals")
+        asked.append((name, time.monotonic()))
+        return Measure.Response(zernike=ZernikeCoefficients(coefficients=[0.0] * 21))
+
+    session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=None, poked=None, snapshot=bench)
+    assert "Map: rms" in asyncio.run(operations.poke(session, 1, 0.1, then_measure=True))
+    (first, moved), (second, taken) = asked
+    assert (first, second) == ("set_signals", "measure") and taken - moved >= operations.SETTLE_S

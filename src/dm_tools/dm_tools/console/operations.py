@@ -1,5 +1,6 @@
 """What the buttons do: each function calls the nodes and returns its outcome in words."""
 
+import asyncio
 import dataclasses
 import math
 from typing import Any
@@ -15,6 +16,9 @@ from dm_tools.console.loops import effective_change, modelled_loop, modelled_way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
 from dm_tools.long_actions import warning_in
+
+#: Between a command and its map, s, as `settle_time` of the calibration is by default.
+SETTLE_S = 0.5
 
 #: What the plans of a calibration are called.
 PLANS = {
@@ -123,7 +127,10 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
     await _set_signals(session, signals)
     session.base, session.poked = base, signals
     text = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
-    return f"{text}. Map: {await measure(session, f'poke {actuator}')}" if then_measure else text
+    if not then_measure:
+        return text
+    await asyncio.sleep(SETTLE_S)
+    return f"{text}. Map: {await measure(session, f'poke {actuator}')}"
 
 
 async def release(session: Session) -> str:
@@ -164,6 +171,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
             session.progress.step, session.progress.text = step, f"actuator {actuator} at {signal:+.2f}"
             shape = [*start[: actuator - 1], signal, *start[actuator:]]
             await _set_signals(session, shape)
+            await asyncio.sleep(SETTLE_S)
             after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), math.inf)).samples
             values.append(first + effective_change(before, after, calibration, actuator))
     except (Refusal, ValueError):
