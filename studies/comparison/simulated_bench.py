@@ -105,7 +105,8 @@ class SimulatedBench:
         other = copy.copy(self)
         other._drive, other.piezo = copy.deepcopy(self._drive), copy.deepcopy(self.piezo)
         other._noise = copy.deepcopy(self._noise)
-        other._interferometer = self._interferometer.with_noise(other._noise)
+        other._interferometer = copy.copy(self._interferometer)  # what never changes is shared
+        other._interferometer.noise = other._noise
         other._fitter = None
         other.reports = list(self.reports)
         return other

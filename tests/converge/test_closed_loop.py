@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ import pytest
 from dm_common.errors import Refusal
 from dm_common.measurement import Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
-from dm_controller.converge.converge_run import ConvergeRun
+from dm_controller.converge.converge_run import solver_of
 from dm_controller.planning.active_calibration import active_calibration
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
@@ -132,9 +130,10 @@ def test_points_without_data_do_not_matter(solver: Solver) -> None:
 
 def test_cancelling_keeps_what_was_measured(solver: Solver) -> None:
     plant = LinearPlant(0.8)
-    with pytest.raises(StoppedLoop, match="cancelled after 2 maps") as caught:
-        converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 9), cancelled=lambda: plant.maps == 2)
-    assert len(caught.value.steps) == 2
+    steps, options = list[LoopStep](), LoopOptions(1e-15, 9)
+    with pytest.raises(StoppedLoop, match="cancelled after 2 maps"):
+        converge(solver, FocusTarget(0.02), plant, options, on_step=steps.append, cancelled=lambda: plant.maps == 2)
+    assert len(steps) == 2
 
 
 def test_failures_of_the_bench_pass_through(solver: Solver) -> None:
@@ -177,8 +176,7 @@ def test_the_action_begins_with_the_tilt_that_a_move_has(
     hold_tilt: bool, axis: tuple[float, float], tilt: float
 ) -> None:
     active = active_calibration(calibration(), mirror_info(), hold_tilt, axis)
-    bench: Any = SimpleNamespace(parameters={}, active_calibration=lambda: active)
     target = FocusTarget(0.02, 0.0, (0.0, tilt, *19 * (0.0,)))
-    result = converge(ConvergeRun(bench)._solver(""), target, LinearPlant())
+    result = converge(solver_of(active, ""), target, LinearPlant())
     assert result.converged
     np.testing.assert_array_equal(result.signals, active.mirror.command(target)[0])

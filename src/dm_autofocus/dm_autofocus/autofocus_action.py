@@ -85,10 +85,7 @@ class AutofocusAction(ProbeAction):
                 search.feed(None)
                 continue
             phase, sample = search.current.phase, self._probe.measure(region)
-            try:
-                search.feed(sample.sharpness, sample.regions)
-            except ValueError as error:
-                raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+            search.feed(sample.sharpness, sample.regions)
             self._report(goal_handle, phase, sample, step.curvature, step=search.measured, steps=search.steps)
         if search.reason:
             self._log.info(f"the range was swept: {search.reason}")

@@ -9,7 +9,7 @@ from dm_autofocus.search.defocus_model import FocusLens
 from dm_autofocus.search.peak_search import NOISE_POINTS, SearchConfig
 from dm_autofocus.search.tracking import TrackConfig
 from dm_autofocus.sharpness import METRICS, WHOLE, check_region
-from dm_common.ros.parameters import AUTOSTART, Parameter, ParameterError, parameters_of
+from dm_common.ros.parameters import AUTOSTART, Parameter, parameters_of
 from dm_common.values import from_values, real, reals, switch, text, whole
 
 PARAMETERS: Final = (
@@ -81,11 +81,8 @@ PARAMETERS: Final = (
 
 
 def check_changes(changes: Mapping[str, Any]) -> None:
-    """Raise ParameterError for a region that does not lie in the image."""
-    try:
-        check_region(changes.get("region", WHOLE))
-    except ValueError as error:
-        raise ParameterError(str(error)) from error
+    """Raise ValueError for a region that does not lie in the image."""
+    check_region(changes.get("region", WHOLE))
 
 
 def focus_optics(values: Mapping[str, Any]) -> FocusOptics:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Frequencies that count: from so many cycles over the image, to so many cycles per pixel.
 LOWEST, HIGHEST = 1.5, 0.1
@@ -29,10 +29,6 @@ STEP = 4.0
 SIGNIFICANT, ANISOTROPY = 5.0, 2.0
 #: Rounds of the fit of a phase that is known modulo a turn.
 ROUNDS = 4
-
-
-class BoresightError(ValueError):
-    """The images do not show where the camera's axis is; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def find_boresight(see: Callable[[float, Floats], NDArray], focus: float, step: 
         pairs: images on either side, in turns.
 
     Raises:
-        BoresightError: the picture does not follow tilt.
+        ValueError: the picture does not follow tilt.
     """
 
     def moved(curvature: float, tilt: Floats) -> tuple[Floats, Floats]:
@@ -96,7 +92,7 @@ def find_boresight(see: Callable[[float, Floats], NDArray], focus: float, step: 
     scale = np.column_stack([by_x, by_y])
     strength = np.linalg.svd(scale, compute_uv=False)
     if not (strength[1] > SIGNIFICANT * max(sigma_x.max(), sigma_y.max()) and strength[0] < ANISOTROPY * strength[1]):
-        raise BoresightError(
+        raise ValueError(
             f"the picture does not follow the mirror's tilt: two equal tilts move it by {np.hypot(*by_x):.2f} and "
             f"{np.hypot(*by_y):.2f} px, with an uncertainty of {max(sigma_x.max(), sigma_y.max()):.2f} px; is "
             "hold_tilt of the focus controller off, does the calibration not know where the actuators are or come from "

@@ -20,9 +20,10 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dm_autofocus.images import ImageError, SettledGate, decompressed, grey
+from dm_autofocus.images import SettledGate, decompressed, grey
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import same_signals
 from dm_common.messages import seconds
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError
@@ -41,7 +42,7 @@ class SharpnessSample:
 
 
 def raw_image(message: Image | CompressedImage) -> Image:
-    """The image itself, or what is in a compressed one. Raises ImageError when it cannot be decoded."""
+    """The image itself, or what is in a compressed one. Raises ValueError when it cannot be decoded."""
     if isinstance(message, Image):
         return message
     return image_message(message.header, *decompressed(bytes(message.data), message.format))
@@ -162,8 +163,7 @@ class FocusProbe:
         answer, driver = self.answer, self._driver
         if answer is None or driver is None or not answer.applied:
             return
-        wanted, requested = np.asarray(answer.signals), np.asarray(driver.requested)
-        reached = wanted.size == requested.size and float(np.abs(wanted - requested).max(initial=0.0)) <= 1e-9
+        reached = same_signals(driver.requested, np.asarray(answer.signals))
         self._gate.written(seconds(driver.header.stamp), driver.moving, reached)
 
     # --- moving and measuring ---
@@ -272,7 +272,7 @@ class FocusProbe:
             image = raw_image(message)
             part = cut(grey(image), region)
             sharpness = METRICS[self._values["metric"]](part)
-        except (ImageError, ValueError) as error:
+        except ValueError as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
         return SharpnessSample(sharpness, image, (part,))
 

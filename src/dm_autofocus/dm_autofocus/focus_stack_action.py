@@ -88,12 +88,9 @@ class FocusStackAction(ProbeAction):
             if stack.positions and (image.encoding, image.is_bigendian) != (before.encoding, before.is_bigendian):
                 text = f"the images changed their encoding from {before.encoding} to {image.encoding}"
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, text)
-            try:
-                if len({region.shape for region in sample.regions}) > 1:
-                    raise ValueError("the images changed their size")
-                stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))
-            except ValueError as error:
-                raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+            if len({region.shape for region in sample.regions}) > 1:
+                raise ValueError("the images changed their size")
+            stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))
             self._publish(Phase.STACK, sample)
             goal_handle.publish_feedback(
                 FocusStack.Feedback(step=len(stack.positions), steps=len(plan), curvature=float(curvature))

@@ -62,10 +62,6 @@ STAMP_AHEAD = 0.5
 MODES = {"L": "mono8", "I;16": "mono16", "I": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
 
 
-class ImageError(ValueError):
-    """An image that cannot be used; the message says why."""
-
-
 def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
     """Pixels (height, width, ...) and encoding of the JPEG or PNG of a `sensor_msgs/CompressedImage`.
 
@@ -74,9 +70,9 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
         image_format: as the message has it; of "bayer_rggb8; jpeg compressed", what stands first.
 
     Raises:
-        ImageError: it is no image that Pillow can read.
+        ValueError: it is no image that Pillow can read.
     """
-    from PIL import Image, UnidentifiedImageError  # only who has compressed images pays for it
+    from PIL import Image  # only who has compressed images pays for it
 
     try:
         with Image.open(io.BytesIO(data)) as image:
@@ -84,8 +80,8 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
             pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
             if decoded.mode == "I":
                 pixels = pixels.astype(np.uint16)
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ImageError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
     mosaic = image_format.partition(";")[0].strip()
     layout = ENCODINGS.get(mosaic)
     if layout is not None and layout.green is not None and pixels.ndim == 2 and pixels.dtype == np.dtype(layout.type):
@@ -102,18 +98,18 @@ def pixels_of(message: Any) -> NDArray:
         message: anything with height, width, encoding, is_bigendian, step (bytes per row) and data.
 
     Raises:
-        ImageError: unknown encoding, or sizes that contradict each other.
+        ValueError: unknown encoding, or sizes that contradict each other.
     """
     layout = ENCODINGS.get(message.encoding)
     if layout is None:
-        raise ImageError(f"encoding = {message.encoding!r}: must be one of {', '.join(ENCODINGS)}")
+        raise ValueError(f"encoding = {message.encoding!r}: must be one of {', '.join(ENCODINGS)}")
     kind = np.dtype(layout.type).newbyteorder(">" if message.is_bigendian else "<")
     width, height = int(message.width), int(message.height)
     pixel = layout.channels * kind.itemsize
     step = int(message.step) or width * pixel
     data = np.frombuffer(message.data, np.uint8)
     if step < width * pixel or len(data) < step * height or width * height == 0:
-        raise ImageError(
+        raise ValueError(
             f"an image of {width} x {height} px {message.encoding} with {step} bytes per row cannot have "
             f"{len(data)} bytes of data"
         )
@@ -127,7 +123,7 @@ def grey(message: Any) -> NDArray:
     neighbours stays independent.
 
     Raises:
-        ImageError: see `pixels_of`.
+        ValueError: see `pixels_of`.
     """
     pixels, layout = pixels_of(message), ENCODINGS[message.encoding]
     taken = pixels[..., layout.channel]

@@ -99,7 +99,7 @@ class ProbeAction(ABC):
 
     @abstractmethod
     def _carry_out(self, goal_handle: WorkerGoal, plan: Any, result: Any) -> None:
-        """Do it and fill the result, its message too. Raises Refusal."""
+        """Do it and fill the result, its message too. Raises Refusal, or ValueError for images that cannot be used."""
 
     def _admit(self, goal: Any) -> None:
         """Raise Refusal of a goal that cannot be, before it ends the one that runs."""
@@ -130,8 +130,8 @@ class ProbeAction(ABC):
                     self._carry_out(goal_handle, plan, result)
                 finally:
                     result.images, result.images_dropped = self._probe.counted, self._probe.dropped
-        except Refusal as error:
-            outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
-            result.error_code, result.message = error.error_code, str(error)
+        except EXPECTED as error:
+            result.error_code, result.message = error_code(error), str(error)
+            outcome = "canceled" if result.error_code == ErrorCode.CANCELED else "abort"
         result.duration = time.monotonic() - started
         return outcome, result

@@ -1,5 +1,6 @@
 """What the signals of a mirror must keep to: a range for each, and how far neighbours may differ."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -17,6 +18,11 @@ AT_LIMIT = 1e-6
 DEGAUSS_STEPS_MIN = 5
 #: Most half-swings: smaller ones than these leave would be below a step of the electronics.
 DEGAUSS_STEPS_MAX = 10000
+
+
+def same_signals(one: Sequence[float] | Floats, other: Floats) -> bool:
+    """Whether two commands (N,) are the same one, but for rounding."""
+    return len(one) == len(other) and float(np.abs(np.asarray(one) - other).max(initial=0.0)) <= SLACK
 
 
 @dataclass(frozen=True)

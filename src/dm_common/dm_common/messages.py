@@ -58,18 +58,6 @@ def seconds(message: Time) -> float:
     return 1e-9 * stamp_ns(message)
 
 
-def limits_from(message: MirrorInfo) -> Limits:
-    """The limits of the mirror that the driver describes.
-
-    Raises:
-        ValueError: naming what makes no sense.
-    """
-    if len(message.neighbour_a) != len(message.neighbour_b):
-        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
-    pairs = np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.intp)
-    return Limits(message.signal_min, message.signal_max, pairs, message.neighbour_difference_max)
-
-
 def mirror_from(message: MirrorInfo) -> Mirror:
     """The mirror that the driver describes.
 
@@ -79,13 +67,16 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     for name in ("actuator_x", "actuator_y"):
         if len(getattr(message, name)) != message.actuators:
             raise ValueError(f"mirror_info: {name} has {len(getattr(message, name))} values, not {message.actuators}")
+    if len(message.neighbour_a) != len(message.neighbour_b):
+        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
+    pairs = np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.intp)
     return Mirror(
         name=message.name,
         serial=message.serial,
         x=np.array(message.actuator_x, dtype=np.float64),
         y=np.array(message.actuator_y, dtype=np.float64),
         working_radius=0.5 * message.working_aperture_diameter,
-        limits=limits_from(message),
+        limits=Limits(message.signal_min, message.signal_max, pairs, message.neighbour_difference_max),
     )
 
 

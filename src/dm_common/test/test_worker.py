@@ -7,7 +7,7 @@ import threading
 import time
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import pytest
 import rclpy
@@ -139,7 +139,7 @@ def test_the_loop_survives_a_callback_that_raises(observer: Observer) -> None:
 class Mover:
     """An action body that runs until it is told to stop or allowed to finish."""
 
-    def __init__(self, observer: Observer, exclusive: str) -> None:
+    def __init__(self, observer: Observer, exclusive: Literal["refuse", "preempt"]) -> None:
         self.release = threading.Event()
         self.started: list[float] = []
         fields = Fields({"settle_time": real(0.0, 0.0, 60.0, "s")})

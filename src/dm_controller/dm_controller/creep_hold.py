@@ -17,7 +17,8 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
-from dm_controller.driver_monitor import DriverMonitor, same_signals
+from dm_common.limits import same_signals
+from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import Moment, SendCommand
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as

@@ -7,14 +7,14 @@ old here, by the steady clock, and a command that no report confirms is reported
 import math
 import statistics
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState, FocusRequest
 
-from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import same_signals
 from dm_common.messages import stamp_ns
 from dm_controller.focus_types import Log, Moment, Order, Progress, PublishState
 
@@ -28,15 +28,8 @@ CLOCK_JUMP_S = 5.0
 MOVES = 20
 #: A first write later than this is of another clock, or of a report that came too late, s.
 LATENCY_MAX_S = 1.0
-#: Signals that differ less are the same command.
-SAME_SIGNAL = 1e-9
 #: How an order ends whose shape somebody else replaced.
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
-
-
-def same_signals(one: Sequence[float] | Floats, other: Floats) -> bool:
-    """Whether two commands (N,) are the same one."""
-    return len(one) == len(other) and float(np.abs(np.asarray(one) - other).max(initial=0.0)) <= SAME_SIGNAL
 
 
 def _not_active(report: ActuatorState) -> Refusal:

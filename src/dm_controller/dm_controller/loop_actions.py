@@ -170,9 +170,9 @@ def serve_loops(node: FocusHost, values: Mapping[str, Any]) -> None:
     calibration = qos.watch(node, "calibration", Calibration, "calibration", qos.LATCHED)
 
     def converge(handle: WorkerGoal) -> tuple[str, Any]:
-        from dm_controller.converge.converge_run import ConvergeRun
+        from dm_controller.converge.converge_run import run_converge
 
-        return ConvergeRun(bench).run(handle)
+        return run_converge(bench, handle)
 
     def build_recipes(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.recipe_run import RecipeRun

@@ -30,7 +30,7 @@ from dm_common.ros import qos
 from dm_common.ros.domains import held_by
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Diagnostics, Health
-from dm_common.ros.parameters import ParameterError, declare
+from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
 from dm_simulation.camera import camera_matrix
@@ -96,10 +96,7 @@ class VirtualBenchNode(Node):
 
     def _check_change(self, changes: Mapping[str, Any]) -> None:
         if self.bench.camera is not None and "camera.distances" in changes:
-            try:
-                self.bench.camera.left_to_focus(changes["camera.distances"])
-            except ValueError as error:
-                raise ParameterError(str(error)) from error
+            self.bench.camera.left_to_focus(changes["camera.distances"])
 
     def _on_change(self, changes: Mapping[str, Any]) -> None:
         if self.bench.camera is not None and "camera.distances" in changes:

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
 
 from dm_bringup.nodes import MODULES
-from dm_common.messages import doubles, limits_from, recipe_book_message
+from dm_common.messages import doubles, mirror_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient
@@ -167,7 +167,7 @@ class FocusRig(DriverRig):
     def calibrate(self) -> None:
         """Have the controller take a calibration, and recipes of the mirror that the driver announces."""
         message = self.calibration()
-        mirror = CalibratedMirror(self._model, limits_from(self._infos[-1]))
+        mirror = CalibratedMirror(self._model, mirror_from(self._infos[-1]).limits)
         plans = {c: mirror.plan(FocusTarget(c)).signals for c in np.linspace(-1.2 * REACH, 1.2 * REACH, 5).tolist()}
         recipes = tuple(Recipe(c, 0.0, signals, signals, 1e-9, 1e-9, 3) for c, signals in plans.items())
         book = RecipeBook(recipes, DEGAUSS_STEPS, 1e-9, 0)

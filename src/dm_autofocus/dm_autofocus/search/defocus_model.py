@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_autofocus.optics import depth_of_focus
-
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Sides of the tiles that power is found in [px]: at most, and at least; and tiles along a side at most.
 TILE_MAX, TILE_MIN, TILES = 256, 24, 3

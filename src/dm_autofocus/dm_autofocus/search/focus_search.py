@@ -29,16 +29,13 @@ class FocusSearch:
     """
 
     def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
-        self.reason, self.unexplained = "", False
+        self._model = None if isinstance(model, str) else model
+        self.reason, self.unexplained = model if isinstance(model, str) else "", False
         self._before = self._changes = 0
-        self._shapes = set[tuple[int, ...]]() if isinstance(model, str) else {model.shape}  # of the images, (H, W) each
-        self._model = model
+        self._shapes = {self._model.shape} if self._model else set()  # of the images, (H, W) each
         self._seen: list[tuple[float, NDArray, float]] = []  # place, powers and sharpness of each image
         self.current: DepthFromDefocus | PeakSearch
-        if isinstance(model, str):
-            self.current, self.reason = PeakSearch(config), model
-        else:
-            self.current = DepthFromDefocus(config, model, start)
+        self.current = DepthFromDefocus(config, self._model, start) if self._model else PeakSearch(config)
 
     @property
     def measured(self) -> int:
@@ -65,7 +62,7 @@ class FocusSearch:
         elif powers is None:
             self._seen.clear()  # of another size than these, whose sharpness they say nothing of
         else:
-            assert isinstance(self._model, DefocusModel)
+            assert self._model is not None  # else there are no powers
             seen = self._model.sharpness(powers)
             self._seen.append((self.current.step.curvature, powers, sharpness))
         if changed:
@@ -87,7 +84,7 @@ class FocusSearch:
     def _powers(self, images: Sequence[NDArray]) -> NDArray | None:
         """Mean powers (K,) of images; None without a model, or where they are not of its size."""
         model = self._model
-        if isinstance(model, str) or not images or any(image.shape != model.shape for image in images):
+        if model is None or not images or any(image.shape != model.shape for image in images):
             return None
         return np.mean([model.powers(image) for image in images], axis=0)
 
@@ -103,7 +100,7 @@ class FocusSearch:
 
     def fitting_scale(self) -> float:
         """How many times as large the focal length should be to explain the images; 1 = as it is, or not known."""
-        if isinstance(self._model, str) or self.current.peak is None or not self._seen:
+        if self._model is None or self.current.peak is None or not self._seen:
             return 1.0
         places, powers, _sharpness = (np.array(part) for part in zip(*self._seen, strict=True))
         return self._model.fitting_scale(self.current.peak.curvature, places, powers)

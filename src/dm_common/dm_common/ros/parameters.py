@@ -176,7 +176,7 @@ def declare(
         unlocked: of a lifecycle node: whether parameters that are not live may change now. With it nothing is raised
             here: the node calls `Values.check` when it is configured, and may be put right before.
         unlock: transition after which they may.
-        check: raises ParameterError for changes that what the node has learnt since denies.
+        check: raises ValueError for changes that what the node has learnt since denies.
 
     Raises:
         ParameterError: naming every parameter that is missing, wrong or unknown.
@@ -208,14 +208,12 @@ def declare(
                     command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {unlock}"
                     raise ParameterError(f"{change.name} changes only while the node is not {state}: `{command}` first")
                 check({change.name: value})
-        except ParameterError as error:
+        except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def apply(changes: list[RosParameter]) -> None:
-        accepted = {
-            change.name: by_name[change.name].check(change.value) for change in changes if change.name in by_name
-        }
+        accepted = {change.name: change.value for change in changes if change.name in by_name}
         values.update(accepted)
         for name in accepted:
             values.problems.pop(name, None)

@@ -10,7 +10,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
@@ -168,12 +168,10 @@ class WorkerActionServer(PatientActionServer):
         name: str,
         body: Callable[[WorkerGoal], tuple[str, Any]],
         *,
-        exclusive: str = "refuse",
+        exclusive: Literal["refuse", "preempt"] = "refuse",
         fields: Fields = NO_FIELDS,
         admit: Callable[[Any], object] = lambda _request: None,
     ) -> None:
-        if exclusive not in ("refuse", "preempt"):
-            raise ValueError(f"exclusive = {exclusive!r}: must be 'refuse' or 'preempt'")
         self._worker_node, self._worker_name = node, name
         self._body = body
         self._exclusive, self._fields, self._admit = exclusive, fields, admit

@@ -135,11 +135,10 @@ class LoopResult:
 
 
 class StoppedLoop(Cancelled):
-    """The loop was asked to stop; `steps` holds what was measured until then."""
+    """The loop was asked to stop after so many maps."""
 
-    def __init__(self, steps: tuple[LoopStep, ...]) -> None:
-        super().__init__(f"cancelled after {len(steps)} maps; the mirror holds the last command")
-        self.steps = steps
+    def __init__(self, maps: int) -> None:
+        super().__init__(f"cancelled after {maps} maps; the mirror holds the last command")
 
 
 def response_ratio(asked: Shape, seen: Shape) -> float:
@@ -186,12 +185,12 @@ def converge(
     drift = response(model, np.zeros_like(signals))
     while True:
         if cancelled():
-            raise StoppedLoop(tuple(steps))
+            raise StoppedLoop(len(steps))
         applied = plant.apply(signals)
         if creep is not None:
             creep.moved(applied)
         if not plant.settle():
-            raise StoppedLoop(tuple(steps))
+            raise StoppedLoop(len(steps))
         number = len(steps) + 1
         measured = plant.measure(f"converge {number}")
         error = measured_shape(measured.coefficients, measured.sag, model) - wanted

@@ -13,7 +13,7 @@ from dm_msgs.action import BuildRecipes
 from dm_msgs.srv import StoreRecipes
 from rclpy.client import Client
 
-from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.creep_record import rested
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import GOES_ON_WITHOUT, shape_text
@@ -26,7 +26,6 @@ from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import recipe_targets
-from dm_controller.planning.target import FocusTarget
 
 #: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.
 STORE_TIMEOUT_S = 10.0
@@ -96,7 +95,12 @@ class RecipeRun:
         builder = RecipeBuilder(
             planner, bench, bench.now, options, state=state, on_step=report, cancelled=bench.cancelled
         )
-        code, text = self._build(builder, targets)
+        code, text = int(ErrorCode.OK), ""
+        try:
+            for target in targets:
+                builder.build(target)
+        except EXPECTED as error:  # a cancel as well; those that are whole stay
+            code, text = error_code(error), str(error)
         recipes, result.maps = builder.recipes, builder.maps
         rest = bench.rest(np.full(calibration.actuators, active.middle))
         if recipes:
@@ -133,17 +137,6 @@ class RecipeRun:
             if now.calibration.id == active.calibration.id:
                 return now.planner
         return active.planner
-
-    def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[int, str]:
-        """Build all; those that are whole stay when the next fails. Returns an ErrorCode and a sentence."""
-        try:
-            for target in targets:
-                builder.build(target)
-        except Cancelled as error:
-            return ErrorCode.CANCELED, str(error)
-        except EXPECTED as error:
-            return error_code(error), str(error)
-        return ErrorCode.OK, ""
 
     def _options(self, goal: Any) -> BuildOptions:
         """What the goal asks for, 0 = configured."""

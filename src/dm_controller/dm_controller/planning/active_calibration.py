@@ -14,7 +14,7 @@ from dm_common import Floats
 from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
-from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
+from dm_common.messages import hysteresis_model_from, mirror_from, recipe_book_from, stamp_ns, taken
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
@@ -127,8 +127,9 @@ def active_calibration(
             ErrorCode.DRIVER_UNAVAILABLE, "the mirror's limits are unknown: no mirror_info from pdm_driver yet"
         )
     try:
+        described = mirror_from(mirror)
         wrong = mismatch(
-            mirror_from(mirror),
+            described,
             calibration.mirror_serial,
             calibration.actuators,
             calibration.aperture_radius,
@@ -137,8 +138,7 @@ def active_calibration(
         if wrong:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
-        limits = limits_from(mirror)
-        model = model_of(calibration, np.asarray(mirror.actuator_x), np.asarray(mirror.actuator_y))
+        limits, model = described.limits, model_of(calibration, described.x, described.y)
         calibrated = CalibratedMirror(model, limits, hold_tilt, axis)
         own = recipes is not None and recipes.calibration_id == calibration.id
         book = recipe_book_from(recipes) if own else NO_RECIPES
@@ -168,17 +168,13 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
             raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")
         return values.reshape(rows, actuators)
 
+    names = ("zernike_offset", "sample_x", "sample_y", "sample_weight", "sag_offset")
+    vectors: dict[str, Any] = {name: np.asarray(getattr(calibration, name), dtype=float) for name in names}
     return InfluenceModel(
-        aperture_radius=calibration.aperture_radius,
+        **taken(calibration, "aperture_radius", "held_out_rms", "held_out_max_zernike"),
+        **vectors,
         influence_zernike=matrix("influence_zernike", len(calibration.zernike_offset)),
-        zernike_offset=np.asarray(calibration.zernike_offset, dtype=float),
-        sample_x=np.asarray(calibration.sample_x, dtype=float),
-        sample_y=np.asarray(calibration.sample_y, dtype=float),
-        sample_weight=np.asarray(calibration.sample_weight, dtype=float),
         influence_sag=matrix("influence_sag", len(calibration.sag_offset)),
-        sag_offset=np.asarray(calibration.sag_offset, dtype=float),
-        held_out_rms=calibration.held_out_rms,
-        held_out_max_zernike=calibration.held_out_max_zernike,
         actuator_x=actuator_x,
         actuator_y=actuator_y,
     )

@@ -38,8 +38,8 @@ class MirrorHold:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
-        # The holder stays until somebody else moves the mirror, also when the lease has run out: see `_current`.
+        self._lock = threading.RLock()
+        # The holder stays until somebody else moves the mirror, also when the lease has run out: see `holder`.
         self._holder = self._purpose = ""
         self._since = self._until = self._duration = 0.0
         self._evicted: dict[str, str] = {}  # whose hold was taken over and by whom, until they hold it again
@@ -48,13 +48,18 @@ class MirrorHold:
     def holder(self) -> str:
         """Who holds the mirror; "" = nobody."""
         with self._lock:
-            return self._current()
+            return self._holder if self._clock() <= self._until else ""
 
     @property
     def sentence(self) -> str:
         """Who holds the mirror, since when and what for; "" = nobody does."""
         with self._lock:
-            return self._sentence()
+            if not self.holder:
+                return ""
+            held = self._clock() - self._since
+            left = f", about {self._duration - held:.0f} s to go" if self._duration > held else ""
+            purpose = f": {self._purpose}" if self._purpose else ""
+            return f"{self._holder} has held the mirror for {held:.0f} s{left}{purpose}; take_over takes it from there"
 
     def ask(self, operation: str, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
         """Hold the mirror, or give it back, as in dm_msgs/HoldMirror.
@@ -70,13 +75,13 @@ class MirrorHold:
         _DURATION.check("duration", duration)
         _LEASE.check("lease", lease)
         with self._lock:
-            current = self._current()
+            current = self.holder
             if operation == Operation.RENEW:
                 self._check_evicted(holder)
             if operation == Operation.RELEASE:
                 self._evicted.pop(holder, None)  # that run has ended
             if current not in ("", holder) and operation != Operation.TAKE_OVER:
-                raise Refusal(ErrorCode.BUSY, self._sentence())
+                raise Refusal(ErrorCode.BUSY, self.sentence)
             if operation == Operation.RELEASE:
                 if holder == self._holder:
                     self._holder = ""
@@ -98,9 +103,9 @@ class MirrorHold:
         with self._lock:
             if not take_over:
                 self._check_evicted(holder)
-            other = self._current() not in ("", holder)
+            other = self.holder not in ("", holder)
             if other and not take_over:
-                raise Refusal(ErrorCode.BUSY, self._sentence())
+                raise Refusal(ErrorCode.BUSY, self.sentence)
             return other
 
     def evict(self, by: str, take_over: bool = False) -> None:
@@ -111,14 +116,11 @@ class MirrorHold:
         with self._lock:
             if take_over:  # it has taken the mirror back
                 self._evicted.pop(by, None)
-            self._evict(by, by or ("a command with take_over" if self._current() else "a command"))
+            self._evict(by, by or ("a command with take_over" if self.holder else "a command"))
 
     def _check_evicted(self, holder: str) -> None:
         if by := self._evicted.get(holder):
             raise Refusal(ErrorCode.PREEMPTED, f"{by} has taken the mirror over")
-
-    def _current(self) -> str:
-        return self._holder if self._clock() <= self._until else ""
 
     def _evict(self, holder: str, by: str) -> None:
         """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
@@ -126,11 +128,3 @@ class MirrorHold:
             self._evicted[self._holder], self._holder = by, ""
             if len(self._evicted) > EVICTED_KEPT:
                 del self._evicted[next(iter(self._evicted))]
-
-    def _sentence(self) -> str:
-        if not self._current():
-            return ""
-        held = self._clock() - self._since
-        left = f", about {self._duration - held:.0f} s to go" if self._duration > held else ""
-        purpose = f": {self._purpose}" if self._purpose else ""
-        return f"{self._holder} has held the mirror for {held:.0f} s{left}{purpose}; take_over takes it from there"

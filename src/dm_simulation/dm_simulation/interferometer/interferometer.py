@@ -5,9 +5,6 @@ x and y over the field, so a map is two thin matrix products, T(y) C T(x)^T with
 pixel centres: about 3 ms for 944 x 944 pixels, and no influence maps to keep in memory.
 """
 
-from __future__ import annotations
-
-import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,6 +101,7 @@ class Interferometer:
     Attributes:
         pitch: m per pixel.
         aperture: (pixels, pixels) bool, pixels whose centre is inside the field.
+        noise: as `noise_rng`; a copy of this object may draw from one of its own.
     """
 
     def __init__(
@@ -122,7 +120,7 @@ class Interferometer:
             raise ValueError(f"interferometer.rotate_deg = {config.rotate_deg}: must be 0, 90, 180 or 270")
         self.config = config
         self.pitch = config.field_diameter / config.pixels
-        self._noise = noise_rng
+        self.noise = noise_rng
         self._field_radius = config.field_diameter / 2
         degree = plate.config.order
 
@@ -189,15 +187,6 @@ class Interferometer:
         x, y = cosine * x + sine * y, cosine * y - sine * x
         return (-x if mount.mount_mirrored else x), y
 
-    def with_noise(self, noise_rng: np.random.Generator) -> Interferometer:
-        """This very instrument and plate, drawing what differs from map to map from `noise_rng`.
-
-        What never changes (polynomials, figure) is shared, not copied.
-        """
-        other = copy.copy(self)
-        other._noise = noise_rng
-        return other
-
     def surface(self, displacement: Array) -> Array:
         """The surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
 
@@ -243,7 +232,7 @@ class Interferometer:
         Args:
             time: s, of any clock, for noise that lasts.
         """
-        config, rng = self.config, self._noise
+        config, rng = self.config, self.noise
         low = np.empty(len(self._low_orders))
         low[0] = config.piston_spread * rng.standard_normal()
         low[1:3] = config.tilt_spread / 2 * rng.standard_normal(2)  # an orthonormal tilt is 2 at the edge
@@ -270,7 +259,7 @@ class Interferometer:
 
     def _drop_out(self, sag: Array) -> None:
         """Lose single pixels (weak fringes) and a few discs (dust)."""
-        size, rng = self.config.pixels, self._noise
+        size, rng = self.config.pixels, self.noise
         sag.flat[rng.integers(0, sag.size, rng.poisson(self.config.specks))] = np.nan
         for _ in range(self.config.blobs):
             row, column = rng.integers(0, size, 2)
