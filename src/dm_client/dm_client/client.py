@@ -244,7 +244,7 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> MoveFocus.Result:
         """Move to a curvature and return when the shape stands."""
-        request = _request(curvature, conic_constant, claim)
+        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)
         goal = filled(MoveFocus.Goal, request=request, tolerance=tolerance, settle_time=settle_time)
         return self.run_action("move_focus", goal, on_feedback, timeout_s)
 
@@ -261,7 +261,7 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> Converge.Result:
         """Close the loop on the interferometer until the measured surface is the requested one."""
-        request = _request(curvature, conic_constant, claim)
+        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)
         goal = filled(Converge.Goal, request=request, method=method, tolerance=tolerance, max_maps=max_maps)
         return self.run_action("converge", goal, on_feedback, timeout_s)
 
@@ -292,7 +292,3 @@ class DeformableMirrorClient(Connection):
     ) -> Calibrate.Result:
         """Measure and store a calibration; by default the full plan, used at once."""
         return self.run_action("calibrate", goal or Calibrate.Goal(activate=True), on_feedback, timeout_s)
-
-
-def _request(curvature: float, conic_constant: float, claim: Claim) -> FocusRequest:
-    return filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)

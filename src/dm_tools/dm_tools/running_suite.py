@@ -181,17 +181,13 @@ class SettledShape(NamedTuple):
     seconds: float
     bound: float
     held: bool
-    predicted: float = 0.0
+    predicted: float
 
 
 def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     """The shape that stands; None = not one that was asked for as a curvature."""
-    values = (
-        {pair.key: pair.value for pair in health["focus_controller"].values} if "focus_controller" in health else {}
-    )
+    values = {pair.key: pair.value for pair in getattr(health.get("focus_controller"), "values", ())}
     if "curvature" not in values:
         return None
-    curvature, age, bound, predicted = (
-        float(values.get(name, 0.0)) for name in ("curvature", "age", "bound", "predicted")
-    )
+    curvature, age, bound, predicted = (float(values[name]) for name in ("curvature", "age", "bound", "predicted"))
     return SettledShape(curvature, age, bound, values["held"] == "True", predicted)

@@ -214,8 +214,8 @@ def test_badges_warn_of_an_unknown_history() -> None:
         calibration=message,
         health={"pdm_driver": DiagnosticStatus()},
     )
-    assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
-    assert status.Badge("history: known") in status.badges(snapshot, "")
+    assert ("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
+    assert ("history: known", "") in status.badges(snapshot, "")
 
 
 def test_the_worst_diagnostics_come_first() -> None:
@@ -526,12 +526,13 @@ def test_what_charts_draw_in_ink_is_light_in_the_dark() -> None:
 
 def test_a_heat_map_is_a_picture_of_the_surface_the_right_way_up() -> None:
     surface = measured_surface(*map_of_terms(np.eye(21)[2] * 4e-7 + np.eye(21)[4] * 4e-7))
-    image, bar = heat_map(surface, surface.extent, "gray", "measured surface").options["series"]
+    options = heat_map(surface, surface.extent, "gray", "measured surface").options
+    (image,) = options["series"]
     assert image["data"] == [pytest.approx([-11.0, 11.0, 11.0, -11.0])]
     grey, opaque = pixels(image)[..., 0] / 255.0, pixels(image)[..., 3] > 0
     np.testing.assert_array_equal(opaque, np.isfinite(surface.sag))  # row 0 is the top
     np.testing.assert_allclose(2.0 * grey[opaque] - 1.0, surface.sag[opaque] / surface.extent, atol=0.02)
-    stops = json.loads(re.search(r"colorStops: (\[.*\])", bar[":renderItem"])[1])  # type: ignore[index]
+    stops = options["grid"][1]["backgroundColor"]["colorStops"]
     assert (stops[0]["color"], stops[-1]["color"]) == ("#ffffff", "#000000")
 
 

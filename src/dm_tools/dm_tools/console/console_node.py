@@ -129,25 +129,22 @@ class ConsoleNode:
 
     def snapshot(self) -> Snapshot:
         """What is known now."""
-        recent, diagnostics = time.monotonic() - SILENCE_S, dict(self._diagnostics)
-        place = self._prefix.rstrip("/")
-        health = {
-            name.rpartition("/")[2]: status
-            for name, (status, when) in diagnostics.items()
-            if when >= recent and name.rpartition("/")[0] == place
+        recent, lost = time.monotonic() - SILENCE_S, {"level": DiagnosticStatus.STALE, "message": "no longer heard"}
+        diagnostics = {
+            name: status if when >= recent else DiagnosticStatus(name=name, **lost)
+            for name, (status, when) in self._diagnostics.copy().items()
         }
         messages = dict(self._connection.messages)
         if "calibration" in messages and not messages["calibration"].id:
             del messages["calibration"]
         return Snapshot(
             **messages,
-            diagnostics={
-                name: status
-                if when >= recent
-                else DiagnosticStatus(level=DiagnosticStatus.STALE, name=name, message="no longer heard")
-                for name, (status, when) in diagnostics.items()
+            diagnostics=diagnostics,
+            health={
+                name.removeprefix(self._prefix): status
+                for name, status in diagnostics.items()
+                if name.rpartition("/")[0] == self._prefix.rstrip("/") and status.level != DiagnosticStatus.STALE
             },
-            health=health,
             bench_time=self._bench_time,
         )
 

@@ -25,11 +25,7 @@ def serve(ros: ConsoleNode, port: int) -> None:
     """Serve the console on loopback until Ctrl-C; the caller closes `ros`."""
     session = Session(ros)
     view = SurfaceView(ros.observer)
-
-    @ui.page("/")
-    def console() -> None:
-        build(session, view)
-
+    ui.page("/")(lambda: build(session, view))
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOST_NAMES)
     app.on_shutdown(session.end)
     # Quasar's bar of what is being fetched has no name for a screen reader, and says nothing about the mirror.

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -35,37 +34,30 @@ def shortened(text: str) -> str:
     return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", text)
 
 
-@dataclass(frozen=True)
-class Badge:
-    """A few words on the state; `kind` is "", "doubt" or "bad"."""
+def badges(snapshot: Any, doubt: str) -> list[tuple[str, str]]:
+    """(text, kind) of mirror, driver, calibration and history, in a few words each; kind is "", "doubt" or "bad".
 
-    text: str
-    kind: str = ""
-
-
-def badges(snapshot: Any, doubt: str) -> list[Badge]:
-    """Mirror, driver, calibration and history in a few words each; `doubt` = why that is not known, "" = it is."""
+    `doubt` = why the history is not known, "" = it is.
+    """
     mirror, state, calibration = snapshot.mirror_info, snapshot.actuator_state, snapshot.calibration
-    shown = [Badge(f"{mirror.name} {mirror.serial}")] if mirror is not None else [Badge("no mirror", "bad")]
+    shown = [(f"{mirror.name} {mirror.serial}", "")] if mirror is not None else [("no mirror", "bad")]
     if "pdm_driver" not in snapshot.health or state is None:
-        shown.append(Badge("driver: not heard", "bad"))
+        shown.append(("driver: not heard", "bad"))
     else:
         active = state.driver_state == ActuatorState.STATE_ACTIVE
         text = DRIVER_STATES.get(state.driver_state, "?") + (", moving" if state.moving else "")
-        shown.append(Badge(f"driver: {text}", "" if active else "bad"))
+        shown.append((f"driver: {text}", "" if active else "bad"))
     if calibration is None:
-        shown.append(Badge("no calibration", "doubt"))
+        shown.append(("no calibration", "doubt"))
     else:
-        quality = QUALITIES.get(calibration.quality, "?")
-        shown.append(
-            Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Capabilities.CALIBRATED else "doubt")
-        )
+        kind = "" if calibration.quality == Capabilities.CALIBRATED else "doubt"
+        shown.append((f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}", kind))
         if calibration.hysteresis.play_radius:
-            shown.append(Badge("history: not known", "doubt") if doubt else Badge("history: known"))
+            shown.append(("history: not known", "doubt") if doubt else ("history: known", ""))
     worst = max((ord(bytes(status.level)) for status in snapshot.health.values()), default=0)
     if worst:
         text = LEVELS.get(bytes([worst]), "?")
-        shown.append(Badge(f"diagnostics: {text}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
+        shown.append((f"diagnostics: {text}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
     return shown
 
 

@@ -6,19 +6,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.interpolate import RBFInterpolator
+from scipy.ndimage import map_coordinates, uniform_filter
 
 from dm_common import Floats
 from dm_common.optics.piston_tilt import remove_plane
-from dm_common.optics.zernike import basis
 from dm_controller.planning.active_calibration import model_of
 
 #: Points of the grid along each side. Finer than the print-through of the actuators, coarse enough for a phone.
 GRID = 101
 #: Share of the aperture's radius that is shown: beyond it, pixels lie on one side of a point only.
 SHOWN = 0.985
-#: Share of the weight of a point's pixels that must be valid.
-WEIGHT_SHARE = 0.6
+#: Share of a point's pixels that must be valid.
+VALID_SHARE = 0.6
 #: Relative difference of two aperture radii below which maps are compared point by point.
 RADIUS_TOLERANCE = 0.02
 
@@ -59,9 +59,9 @@ class Surface:
 
 
 def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
-    """A map on the grid: means over the pixels around each point, weighted by their nearness.
+    """A map on the grid: means over the pixels around each point.
 
-    Points without `WEIGHT_SHARE` of their pixels hold no data: a mean over one side would be off by the slope.
+    Points without `VALID_SHARE` of their pixels hold no data: a mean over one side would be off by the slope.
 
     Args:
         sag: (H, W) m, row 0 = top, NaN = no data.
@@ -69,34 +69,26 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
     Raises:
         ValueError: the aperture radius of the map is not positive, or no pixel of the aperture is valid.
     """
-    if not info.aperture_radius_px > 0:
-        raise ValueError(f"surface_map_info: aperture_radius_px = {info.aperture_radius_px:g}: must be positive")
-    step = 2.0 * info.aperture_radius_px / (GRID - 1)
+    radius = info.aperture_radius_px
+    if not radius > 0:
+        raise ValueError(f"surface_map_info: aperture_radius_px = {radius:g}: must be positive")
+    x, y, shown = _disc()
+    places = info.centre_y - radius * y, info.centre_x + radius * x
+    around = 2 * round(radius / (GRID - 1)) + 1  # odd: a mean must be of what lies about its middle
     valid = np.isfinite(sag)
-    filled = np.where(valid, sag, 0.0).astype(np.float32)
-    rows = _nearness(sag.shape[0], info.centre_y, step)
-    columns = _nearness(sag.shape[1], info.centre_x, step)
-    found = rows @ valid.astype(np.float32) @ columns.T
-    whole = max(1.0, step) ** 2  # what the weights of one point sum to
-    enough = (found >= WEIGHT_SHARE * whole) & _disc()[2]
-    mean = np.where(enough, rows @ filled @ columns.T / np.where(enough, found, 1.0), np.nan)
+    share, mean = (
+        map_coordinates(uniform_filter(values.astype(np.float32), around, mode="constant"), places, order=1)
+        for values in (valid, np.where(valid, sag, 0.0))
+    )
+    enough = shown & (share >= VALID_SHARE)
+    mean = np.where(enough, mean / np.where(enough, share, 1.0), np.nan)
     return Surface(remove_plane(mean.astype(np.float64)), info.aperture_radius)
-
-
-def _nearness(pixels: int, centre: float, step: float) -> NDArray[np.float32]:
-    """(GRID, pixels): weights that fall linearly to 0 at the next point, or at the next pixel of a coarse map.
-
-    Unlike means over the pixels nearest to a point, they are centred on it wherever the pixels lie.
-    """
-    place = np.arange(pixels) - centre
-    point = (np.arange(GRID)[:, None] - (GRID - 1) / 2) * step
-    return np.maximum(0.0, 1.0 - np.abs(place - point) / max(1.0, step)).astype(np.float32)
 
 
 class SurfaceModel:
     """What a calibration predicts, on the grid. Shapes: N actuators, K terms.
 
-    Between the sampling points the 21 terms are exact, and what is beyond them is interpolated linearly.
+    Between the sampling points the sag is that of a thin plate through them.
 
     Raises ValueError, naming the field, for arrays of the calibration that do not fit together.
     """
@@ -108,16 +100,8 @@ class SurfaceModel:
         self._zernike, self._zernike_offset = model.influence_zernike, model.zernike_offset
         points = np.column_stack([model.sample_x, model.sample_y])
         values = np.column_stack([model.influence_sag, model.sag_offset])
-        terms = basis(model.sample_x, model.sample_y)
-        coefficients = np.linalg.lstsq(terms, values, rcond=None)[0]
-        rest = values - terms @ coefficients
-        x, y, inside = _disc()
-        wanted = np.column_stack([x[inside], y[inside]])
-        between = LinearNDInterpolator(points, rest)(wanted)
-        beyond = np.isnan(between[:, 0])  # outside the outermost ring of points
-        between[beyond] = NearestNDInterpolator(points, rest)(wanted[beyond])
-        self._inside = inside
-        self._sag = basis(wanted[:, 0], wanted[:, 1]) @ coefficients + between
+        x, y, self._inside = _disc()
+        self._sag = RBFInterpolator(points, values)(np.column_stack([x[self._inside], y[self._inside]]))
 
     def surface(self, effective: Floats) -> Surface:
         """The surface under the effective signals (N,)."""

@@ -64,7 +64,7 @@ class Message:
 
 
 class BagWriter:
-    """Writes a recording. Use as a context manager; not to be used from several threads at once."""
+    """Writes a recording until it is closed; not to be used from several threads at once."""
 
     def __init__(self, folder: Path) -> None:
         """Begin a recording in the new folder `folder`.
@@ -116,12 +116,6 @@ class BagWriter:
         for path in self.folder.iterdir():
             with path.open("rb") as written:
                 os.fsync(written.fileno())
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
 
 
 class BagReader:

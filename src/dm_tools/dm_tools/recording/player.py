@@ -2,12 +2,12 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 
-import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
+from dm_client.connection import Connection
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Topic
 from dm_tools.recording.interfaces import UnknownTypeError, message_class
 from dm_tools.recording.recorder import COMMON
@@ -62,21 +62,17 @@ def play(
     read as nonsense.
 
     Args:
-        rate: times faster than recorded.
+        rate: times faster than recorded, above 0.
         progress: called with the time in the recording, s.
         remark: called with a sentence for each topic that is left out.
 
     Raises:
-        ValueError: a rate that is not above 0, or the state of a driver where one runs.
+        ValueError: the state of a driver where one runs.
         BagError: the file is damaged.
     """
-    if not rate > 0.0:
-        raise ValueError(f"rate = {rate:g}: must be above 0")
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("dm_player", context=context)
-    try:
-        publishers = {}
+    with closing(Connection("dm_player", "", domain, topics={}, watched={})) as connection:
+        connection.start()
+        node, publishers = connection.node, {}
         for topic in [bag.topics[name] for name in names]:
             try:
                 kind = message_class(topic.type_name)
@@ -102,9 +98,6 @@ def play(
         for publisher in publishers.values():  # or the last messages would leave with their publisher
             publisher.wait_for_all_acked()
         return counts
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
 
 
 def _check_no_driver(node: Node, name: str) -> None:

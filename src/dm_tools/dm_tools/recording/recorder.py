@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import Parameter, ParameterEvent
+from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
@@ -44,7 +44,7 @@ COMMON = ("/diagnostics", "/rosout", "/clock", "/tf", "/tf_static", PARAMETER_EV
 
 
 class Recorder:
-    """Records until it is closed. Use as a context manager.
+    """Records until it is left: use it as a context manager.
 
     Args:
         folder: of the new recording.
@@ -106,10 +106,11 @@ class Recorder:
         if self._failure is not None:
             raise OSError(f"{self._bag.folder}: the recording ended early: {str(self._failure) or repr(self._failure)}")
 
-    def close(self) -> None:
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
         """Leave the ROS graph and finish the recording. Raises OSError when not everything could be written."""
-        if not self._writer.is_alive():
-            return
         self._stopping = True
         self._spinning.join(10.0 * SPIN_S + 1.0)
         self._executor.shutdown(1.0)
@@ -121,12 +122,6 @@ class Recorder:
             self._bag.close()
         finally:
             self.check()
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
 
     # --- in the executor's thread ---
 
@@ -170,11 +165,6 @@ class Recorder:
 
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
-    @property
-    def nodes(self) -> int:
-        """How many nodes have told their parameters, one that was started anew counted again."""
-        return sum(again == math.inf for again in self._asked.values())
-
     def _ask_parameters(self) -> None:
         """Ask nodes of the suite for their parameters, once each, and each that is started anew; answers come later."""
         if PARAMETER_EVENTS not in self._subscribed:
@@ -195,29 +185,22 @@ class Recorder:
             listed.add_done_callback(lambda future, path=path, node=node: self._on_listed(path, node, future))
 
     def _on_listed(self, path: str, node: bytes, listed: Any) -> None:
-        """Fetch the values of the names listed, one after another; they are recorded as if the node began now.
+        """Fetch the values of the names listed; they are recorded as if the node began now."""
+        client, names = self._clients[path], listed.result().result.names
 
-        Where one has no value, rclpy leaves out all that follow; and a service keeps ten requests at most.
-        """
-        names = list(listed.result().result.names)
-        event = ParameterEvent(node=path)
-        begun = self._seen[node]  # what changes from then on is told later, so the newer value stands
+        def fetch(answer: Any) -> None:  # where one of those asked for has no value, rclpy answers with none at all
+            types = zip(names, answer.result().types, strict=False)
+            known = [name for name, type_number in types if type_number != ParameterType.PARAMETER_NOT_SET]
+            client.get_parameters(known).add_done_callback(lambda answer: keep(known, answer.result().values))
 
-        def fetch_next() -> None:
-            if names:
-                name = names.pop(0)
-                asked = self._clients[path].get_parameters([name])
-                asked.add_done_callback(lambda answer: keep(name, answer.result().values))
-            else:
-                self._asked[node] = math.inf
-                self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, serialize_message(event), begun))
+        def keep(known: Sequence[str], values: Sequence[Any]) -> None:
+            given = [Parameter(name=name, value=value) for name, value in zip(known, values, strict=False)]
+            event = serialize_message(ParameterEvent(node=path, new_parameters=given))
+            # What changes from when it was seen is told later, so the newer value stands.
+            self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, event, self._seen[node]))
+            self._asked[node] = math.inf
 
-        def keep(name: str, answer: Sequence[Any]) -> None:
-            self._asked[node] = time.monotonic() + ASK_AGAIN_S
-            event.new_parameters += [Parameter(name=name, value=value) for value in answer]
-            fetch_next()
-
-        fetch_next()
+        client.get_parameter_types(names).add_done_callback(fetch)
 
     # --- in the writer's thread ---
 
@@ -243,7 +226,6 @@ def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
     latched = all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
     return QoSProfile(
         depth=DEPTH,
-        history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

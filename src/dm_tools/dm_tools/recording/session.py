@@ -7,6 +7,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from dm_msgs.msg import ActuatorHysteresis
+from dm_msgs.msg import Calibration as CalibrationMsg
 from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import deserialize_message
 
@@ -26,39 +28,18 @@ from dm_tools.recording.interfaces import message_class
 #: Topics that a calibration is made again from; the last part of their names.
 FEEDBACK = "calibrate/_action/feedback"
 TOPICS = ("mirror_info", "actuator_state", "zernike", "surface_samples", "surface_map_info", "calibration", FEEDBACK)
+
+
+def _arrays(kind: Any) -> list[str]:
+    """The fields of a message that hold numbers of any count."""
+    return [name for name, type_name in kind.get_fields_and_field_types().items() if type_name == "sequence<double>"]
+
+
 #: Fields of dm_msgs/Calibration that must agree to the last bit.
 COMPARED = (
-    "influence_zernike",
-    "zernike_offset",
-    "influence_sag",
-    "sag_offset",
-    "sample_x",
-    "sample_y",
-    "sample_weight",
-    "region_weights",
-    "hysteresis.play_radius",
-    "hysteresis.play_weight",
-    "hysteresis.duhem_slope",
-    "hysteresis.duhem_weight",
-    "hysteresis.fading_rate",
-    "hysteresis.fading_weight",
-    "hysteresis.creep_rate",
-    "hysteresis.creep_time",
-    "hysteresis.creep_spectrum",
-    "hysteresis.lag_spectrum",
-    "hysteresis.creep_slope",
-    "hysteresis.crept",
-    "hysteresis.creep_covariance",
+    *_arrays(CalibrationMsg),
+    *(f"hysteresis.{name}" for name in (*_arrays(ActuatorHysteresis), "creep_rate", "creep_slope")),
 )
-
-
-@dataclass
-class _Run:
-    """One goal of `calibrate` while its messages are gathered."""
-
-    begun: int
-    plan: str = ""
-    ended: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +82,20 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     if not 0 <= number <= len(runs):
         raise RecordingError(f"run {number}: the recording has 1 to {len(runs)}; 0 = the last")
     index = (number or len(runs)) - 1
-    chosen = runs[index]
-    end = runs[index + 1].begun if index + 1 < len(runs) else np.iinfo(np.int64).max
-    mirrors = [info for time, info in received["mirror_info"] if time <= chosen.ended]
+    (begun, first), (ended, _last) = runs[index][0], runs[index][-1]
+    end = runs[index + 1][0][0] if index + 1 < len(runs) else np.iinfo(np.int64).max
+    mirrors = [info for time, info in received["mirror_info"] if time <= ended]
     if not mirrors:
         raise RecordingError(f"{bag.path}: no mirror_info before the run ended: begin the recording earlier")
     mirror = mirror_from(mirrors[-1])
     during = {
-        name: [message for time, message in messages if chosen.begun <= time < end]
-        for name, messages in received.items()
+        name: [message for time, message in messages if begun <= time < end] for name, messages in received.items()
     }
     maps = _maps(during)
-    moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]
-    before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
-    run = RecordedRun(mirror, tuple(moves), maps, chosen.plan, _model(before[-1]) if before else None)
-    parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
+    moves = [move for time, move in _moves(received["actuator_state"], mirror) if begun <= time < end]
+    before = [message for time, message in received["calibration"] if time < begun and message.id]
+    run = RecordedRun(mirror, tuple(moves), maps, first.feedback.plan, _model(before[-1]) if before else None)
+    parameters, remarks = _parameters(bag, f"{prefix}calibration", begun)
     stamps = {measured.stamp_ns for measured in maps}  # also of maps taken since the run
     known = {message.id for message in before}
     made = [each for each in during["calibration"] if each.id not in known and stamp_ns(each.header.stamp) in stamps]
@@ -156,12 +136,11 @@ def _decode(message: Message) -> Any:
         ) from error
 
 
-def _runs(messages: Iterable[tuple[int, Any]]) -> list[_Run]:
-    """Goals in the order they began."""
-    runs: dict[bytes, _Run] = {}
+def _runs(messages: Iterable[tuple[int, Any]]) -> list[list[tuple[int, Any]]]:
+    """The messages of each goal, with their times; goals in the order they began."""
+    runs: dict[bytes, list[tuple[int, Any]]] = {}
     for time, message in messages:
-        run = runs.setdefault(bytes(message.goal_id.uuid), _Run(begun=time, plan=message.feedback.plan))
-        run.ended = time
+        runs.setdefault(bytes(message.goal_id.uuid), []).append((time, message))
     return list(runs.values())
 
 

@@ -29,7 +29,9 @@ LOGS = ("/parameter_events", "/rosout")
 #: Whoever may publish it turns the time of all others.
 CLOCK = "/clock"
 HEALTH = "/diagnostics"
-#: What an operator's program calls.
+#: What an operator's program hears and calls.
+_HEARD = (HEALTH, "actuator_state", "calibration", "capabilities", "mirror_info", "recipes")
+_MAPS = ("surface_map", "surface_map_info")
 _OPERATION = ("flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("build_recipes", "calibrate", "converge", "degauss", "move_focus")
 
@@ -110,20 +112,14 @@ _DECLARED = (
     ),
     NodeInterface(
         "dm_console_*",
-        subscribe=(
-            *(HEALTH, "/rosout", "actuator_estimate", "actuator_state", "calibration", "capabilities"),
-            *("mirror_info", "recipes", "surface_map", "surface_map_info", "zernike"),
-        ),
+        subscribe=(*_HEARD, *_MAPS, "/rosout", "actuator_estimate", "zernike"),
         request=_OPERATION,
         call=_LONG_OPERATION,
         enclave="console",
     ),
     NodeInterface(
         "dm_client_*",
-        subscribe=(
-            *(HEALTH, "actuator_state", "calibration", "capabilities"),
-            *("mirror_info", "recipes", "surface_map", "surface_map_info"),
-        ),
+        subscribe=(*_HEARD, *_MAPS),
         request=(*_OPERATION, "ingest_file", "update_calibration"),
         call=_LONG_OPERATION,
         enclave="cli",

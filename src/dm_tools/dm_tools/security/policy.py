@@ -64,7 +64,7 @@ class Profile:
     @property
     def ns(self) -> str:
         """The namespace as ROS writes it."""
-        return f"/{self.namespace.strip('/')}" if self.namespace.strip("/") else "/"
+        return f"/{self.namespace.strip('/')}"
 
     def path(self, enclave: str) -> str:
         """Path of an enclave."""
@@ -107,17 +107,13 @@ def policy_xml(profile: Profile, enclave: str) -> str:
                     listed = xml.SubElement(one, f"{element}s", {rule: "ALLOW"})
                     for name in sorted(set(names)):
                         xml.SubElement(listed, element).text = name
-    return _text(policy)
+    xml.indent(policy)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml.tostring(policy, encoding="unicode")}\n'
 
 
 def governance_xml(profile: Profile) -> str:
     """Who may join the domain and how: authenticated participants only, access control, everything encrypted."""
     return GOVERNANCE.format(domain=profile.domain, schema=GOVERNANCE_SCHEMA)
-
-
-def _text(document: xml.Element) -> str:
-    xml.indent(document)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml.tostring(document, encoding="unicode")}\n'
 
 
 def dds_topics(profile: Profile, enclave: str) -> dict[str, set[str]]:

@@ -3,6 +3,7 @@
 import math
 import re
 from contextlib import suppress
+from copy import copy
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,11 +75,9 @@ def run_calibration(client: Any, goal: Any) -> Any:
 
 def expected_run(client: Any, goal: Any) -> str:
     """How long the whole run of a Calibrate goal takes and how good it will be; nothing moves."""
-    goal.dry_run = True
-    try:
-        return str(client.calibrate(goal).message).removesuffix("; nothing was moved")
-    finally:
-        goal.dry_run = False
+    question = copy(goal)
+    question.dry_run = True
+    return str(client.calibrate(question).message).removesuffix("; nothing was moved")
 
 
 def metres(text: str) -> float:

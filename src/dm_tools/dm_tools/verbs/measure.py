@@ -52,13 +52,12 @@ def measure(
     if figures["curvature"] is not None:
         console.print(f"defocus: as of a surface of {round(figures['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}", soft_wrap=True)
+    then = "./dm check compares a map with the calibration in use"
     if reference_sphere is not None:
         figures["pitch"] = _scale(info, coefficients, reference_sphere)
-        write_json(json, {"measure": figures})
-        next_step("put the parameters into the parameter file; then take the sphere out")
-        return
+        then = "put the parameters into the parameter file; then take the sphere out"
     write_json(json, {"measure": figures})
-    next_step("./dm check compares a map with the calibration in use")
+    next_step(then)
 
 
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:

@@ -117,9 +117,7 @@ def outlines(places: tuple[tuple[float, float], ...]) -> list[tuple[NDArray[np.f
             size, turned = float(distance.min()) / 2.0, float(np.arctan2(nearest[1], nearest[0]))
         angle = turned + np.arange(6) * np.pi / 3
         sides = np.column_stack([np.cos(angle), np.sin(angle), np.full(6, -size)])
-        hexagon = 2.0 / np.sqrt(3.0) * size * np.column_stack([np.cos(angle + np.pi / 6), np.sin(angle + np.pi / 6)])
-        cuts = (hexagon @ to_others.T).max(axis=0) > (0.5 + 1e-9) * distance**2
-        bisectors = np.column_stack([to_others / distance[:, None], -0.5 * distance])[cuts]
+        bisectors = np.column_stack([to_others / distance[:, None], -0.5 * distance])
         corners = HalfspaceIntersection(np.vstack([sides, bisectors]), np.zeros(2)).intersections
         corners = np.unique(corners.round(9), axis=0)
         cells.append((corners[np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))] + point, size))

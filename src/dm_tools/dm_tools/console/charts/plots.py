@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -28,12 +27,6 @@ BAR_GAP, BAR_WIDTH = 10, 14
 DRAW = """(params, api) => {
   const [x, y] = api.coord([api.value(0), api.value(1)]), [right, bottom] = api.coord([api.value(2), api.value(3)]);
   return {type: 'image', style: {image: '%s', x, y, width: right - x, height: bottom - y}};
-}"""
-#: The same with a gradient from top to bottom.
-DRAW_BAR = """(params, api) => {
-  const [x, y] = api.coord([api.value(0), api.value(1)]), [right, bottom] = api.coord([api.value(2), api.value(3)]);
-  const fill = {type: 'linear', x: 0, y: 0, x2: 0, y2: 1, colorStops: %s};
-  return {type: 'rect', shape: {x, y, width: right - x, height: bottom - y}, style: {fill}};
 }"""
 
 
@@ -86,6 +79,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
     high = limit * factor
     share = np.linspace(0.0, 1.0, 33)
     stops = [{"offset": k, "color": to_hex(colormaps[colours](1.0 - k))} for k in share.tolist()]
+    shades = {"type": "linear", "x": 0, "y": 0, "x2": 0, "y2": 1, "colorStops": stops}
     # No numbers at the ends, which are not round.
     plain = {"splitLine": {"show": False}, "axisLabel": {"color": INK, "showMinLabel": False, "showMaxLabel": False}}
     frame = {"show": True, "borderColor": INK, "top": TOP, "bottom": BOTTOM}
@@ -94,7 +88,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
         f"rms {surface.rms * 1e9:.3g} nm",
         grid=[
             frame | {"left": LEFT, "right": RIGHT},
-            frame | {"right": RIGHT - BAR_GAP - BAR_WIDTH, "width": BAR_WIDTH},
+            frame | {"right": RIGHT - BAR_GAP - BAR_WIDTH, "width": BAR_WIDTH, "backgroundColor": shades},
         ],
         xAxis=[
             axis(f"x, {length}", -reach, reach, nameGap=26, **plain),
@@ -105,15 +99,14 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
             axis(f"sag, {unit}", -high, high, position="right", nameLocation="end", nameGap=10, gridIndex=1, **plain),
         ],
         series=[
-            _drawn(DRAW % _image(surface.sag / limit, colours), [-reach, reach, reach, -reach]),
-            _drawn(DRAW_BAR % json.dumps(stops), [0, high, 1, -high]) | {"xAxisIndex": 1, "yAxisIndex": 1},
+            {
+                "type": "custom",
+                "silent": True,
+                "data": [[-reach, reach, reach, -reach]],
+                ":renderItem": DRAW % _image(surface.sag / limit, colours),
+            }
         ],
     )
-
-
-def _drawn(code: str, corners: list[float]) -> dict[str, Any]:
-    """What `code` draws between `corners`: left, top, right, bottom."""
-    return {"type": "custom", "silent": True, "data": [corners], ":renderItem": code}
 
 
 def _image(values: NDArray[np.float64], colours: str) -> str:

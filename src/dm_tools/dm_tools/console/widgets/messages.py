@@ -37,9 +37,7 @@ class Header:
     def refresh(self, snapshot: Snapshot) -> None:
         progress = self._session.shown_progress
         shown = badges(snapshot, self._session.ros.observer.now(snapshot.bench_time).doubt)
-        self._badges.set_content(
-            "".join(f'<span class="badge {badge.kind}">{escape(badge.text)}</span>' for badge in shown)
-        )
+        self._badges.set_content("".join(f'<span class="badge {kind}">{escape(text)}</span>' for text, kind in shown))
         running = bool(progress.title)
         self._line.set_visibility(running)
         if running:
