@@ -389,7 +389,12 @@ def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "cannot be read"), ("<dds", "is no XML"), ("<dds/>", "does not set maxInitialPeersRange, segment_size")],
+    [
+        (None, "cannot be read"),
+        ("<dds", "is no XML"),
+        ("<dds/>", "does not set maxInitialPeersRange"),
+        ("<dds><type>SHM</type></dds>", "does not set maxInitialPeersRange, segment_size"),
+    ],
 )
 def test_dds_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str | None, words: str) -> None:
     path = tmp_path / "profile.xml"

@@ -146,7 +146,7 @@ class AutofocusAction(ProbeAction):
         return f"moves may err by {bound * 1e9:.0f} nm"
 
     def _track(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region, peak: Peak, result: Any) -> None:
-        """Stay on the peak until cancelled or pre-empted: ends by Refusal only, and not for a controller that died."""
+        """Stay on the peak until cancelled or pre-empted: ends by an error only, and not for a controller that died."""
         tracker = self._tracker(peak, config, region)
         position = peak.curvature
         while True:

@@ -6,13 +6,24 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from dm_common.ros.shared_memory import PROFILE, RANGE, SHARED_MEMORY, remove_orphaned_segments, use_udp_alone
+from dm_common.ros import shared_memory
+from dm_common.ros.shared_memory import (
+    PEERS,
+    PROFILE,
+    RANGE,
+    SHARED_MEMORY,
+    UDP,
+    UDP_LOCAL,
+    WHOLE,
+    remove_orphaned_segments,
+    use_udp_alone,
+)
 
 NODE = "import rclpy; rclpy.init(domain_id={}); node = rclpy.create_node('a'); print('ready', flush=True); input()"
 OWN_LOCK = re.compile("fastrtps_[0-9a-f]{16}_el")
@@ -48,20 +59,46 @@ def test_segments_go_after_their_process_was_killed(domain: int) -> None:
 @pytest.mark.parametrize(
     ("given", "reach", "profile", "alone"),
     [
-        ("LOCALHOST", "SYSTEM_DEFAULT", "fastdds.xml", "fastdds_udp_local.xml"),
-        ("SUBNET", "SUBNET", "fastdds.xml", "fastdds_udp.xml"),
+        ("LOCALHOST", "SYSTEM_DEFAULT", WHOLE, UDP_LOCAL),
+        ("SUBNET", "SUBNET", WHOLE, UDP),
+        ("LOCALHOST", "SYSTEM_DEFAULT", UDP, UDP_LOCAL),
+        ("LOCALHOST", "SYSTEM_DEFAULT", UDP_LOCAL, UDP_LOCAL),
         ("LOCALHOST", "LOCALHOST", "of_the_user.xml", "of_the_user.xml"),
     ],
 )
 def test_a_process_takes_the_profile_without_shared_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, reach: str, profile: str, alone: str
+    environment: Callable[..., dict[str, str]], given: str, reach: str, profile: str, alone: str
 ) -> None:
-    for name in (profile, "fastdds_udp.xml", "fastdds_udp_local.xml"):
-        (tmp_path / name).touch()
-    monkeypatch.setenv(PROFILE, str(tmp_path / profile))
-    monkeypatch.setenv(RANGE, given)
-    use_udp_alone()
-    assert (os.environ[RANGE], os.environ[PROFILE]) == (reach, str(tmp_path / alone))
+    assert environment(given, profile) == {RANGE: reach, PROFILE: alone}
+
+
+def test_with_peers_or_another_middleware_nodes_stay_as_they_were_told(
+    environment: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A Fast DDS profile keeps no other middleware to the machine, and only LOCALHOST and SUBNET heed peers."""
+    told = {RANGE: "LOCALHOST", PROFILE: WHOLE}
+    monkeypatch.setenv(PEERS, "192.168.3.4")
+    assert environment("LOCALHOST", WHOLE) == told
+    assert environment("SUBNET", WHOLE) == {RANGE: "SUBNET", PROFILE: UDP}
+    monkeypatch.delenv(PEERS)
+    monkeypatch.setattr(shared_memory, "get_rmw_implementation_identifier", lambda: "rmw_cyclonedds_cpp")
+    assert environment("LOCALHOST", WHOLE) == told
+
+
+@pytest.fixture
+def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, str]]:
+    """What a process takes that is given this range and this profile, among those of the suite."""
+    monkeypatch.delenv(PEERS, raising=False)
+
+    def environment(given: str, profile: str) -> dict[str, str]:
+        for name in (profile, WHOLE, UDP, UDP_LOCAL):
+            (tmp_path / name).touch()
+        monkeypatch.setenv(PROFILE, str(tmp_path / profile))
+        monkeypatch.setenv(RANGE, given)
+        use_udp_alone()
+        return {RANGE: os.environ[RANGE], PROFILE: Path(os.environ[PROFILE]).name}
+
+    return environment
 
 
 @pytest.mark.parametrize("profile", ["", "/nowhere/fastdds.xml"])

@@ -166,7 +166,7 @@ def crept(features: Floats, time: Floats, start: float, moved: Floats | None = N
 
 def _moved(time: Floats, start: float, moved: Floats | None) -> Floats:
     """(M,) s, when each row began to stand; see :func:`crept`."""
-    return np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
+    return np.concatenate(([start], time[:-1])) if moved is None else np.clip(moved, start, time)
 
 
 def weight_of(rate: float) -> float:

@@ -35,8 +35,7 @@ MAP = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 #: A publisher whose process does not say for so long that it lives counts as dead, s.
 LEASE_S = 1.0
-#: A run that may have taken hours is not given up for a node before it has been lost for so long, s: a machine that
-#: stalls loses all nodes for a moment.
+#: A node counts as dead once it has been lost for so long, s: a machine that stalls loses all nodes for a moment.
 SURE_S = 0.7
 #: A node that has not appeared for so long after the one that watches it was started is missing, s.
 APPEAR_S = 5.0

@@ -6,8 +6,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-#: What names the Fast DDS profile, and how far nodes look for each other.
-PROFILE, RANGE = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+from rclpy.utilities import get_rmw_implementation_identifier
+
+#: What names the Fast DDS profile, how far nodes look for each other, and machines beyond.
+PROFILE, RANGE, PEERS = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
+#: The profiles of dm_bringup.
+WHOLE, UDP, UDP_LOCAL = "fastdds.xml", "fastdds_udp.xml", "fastdds_udp_local.xml"
 #: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 
@@ -15,12 +19,15 @@ SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 def use_udp_alone() -> None:
     """Let this process do without shared memory: by one of the profiles for that, beside the one of the suite.
 
-    To be called before ROS is initialised. A profile of the user stays. With LOCALHOST, rmw_fastrtps would add shared
-    memory to any profile: one that is kept to the machine by itself stands for it.
+    To be called before ROS is initialised. With LOCALHOST, rmw_fastrtps would add shared memory to any profile: one
+    that is kept to the machine by itself stands for it. All stays with a profile of the user's own, with another
+    middleware, for which only LOCALHOST keeps to the machine, and with peers beside LOCALHOST, which alone heeds them.
     """
     profile, local = Path(os.environ.get(PROFILE) or "none"), os.environ.get(RANGE) == "LOCALHOST"
-    alone = profile.with_name("fastdds_udp_local.xml" if local else "fastdds_udp.xml")
-    if profile.name == "fastdds.xml" and alone.is_file():
+    alone = profile.with_name(UDP_LOCAL if local else UDP)
+    if profile.name not in (WHOLE, UDP, UDP_LOCAL) or not alone.is_file() or (local and os.environ.get(PEERS)):
+        return
+    if get_rmw_implementation_identifier().startswith("rmw_fastrtps"):
         os.environ[PROFILE] = str(alone)
         if local:
             os.environ[RANGE] = "SYSTEM_DEFAULT"

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from dm_bringup.nodes import NODES
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
-#: Each node takes a segment of 16 MB in /dev/shm, see config/fastdds.xml.
-SHARED_MEMORY_MIN = 128e6
+#: Virtual bench, autofocus and every program take a segment of 16 MB in /dev/shm, see config/fastdds.xml.
+SHARED_MEMORY_MIN = 60e6
 DISK_MIN = 1e9
 #: What the suite keeps in ~/.ros unless configured otherwise.
 FOLDERS = ("dm_bench", "dm_calibrations")
@@ -82,7 +82,8 @@ def profile() -> Finding | None:
     except ElementTree.ParseError as error:
         return Finding(f"the Fast DDS profile {path} is no XML: {error}", cure)
     names = {element.tag.rpartition("}")[2] for element in tree.iter()}
-    if missing := {"segment_size", "maxInitialPeersRange"} - names:
+    wanted = {"maxInitialPeersRange"} | ({"segment_size"} if tree.find(".//{*}type[.='SHM']") is not None else set())
+    if missing := wanted - names:
         return Finding(
             f"the Fast DDS profile {path} does not set {', '.join(sorted(missing))}",
             "take over these settings from config/fastdds.xml of dm_bringup",
@@ -96,7 +97,7 @@ def shared_memory() -> Finding | None:
     free = shutil.disk_usage(folder).free if folder.is_dir() else 0
     if free < SHARED_MEMORY_MIN:
         return Finding(
-            f"/dev/shm has {free / 1e6:.0f} MB free; each node takes 17 MB",
+            f"/dev/shm has {free / 1e6:.0f} MB free; each program, virtual bench and autofocus take 17 MB",
             "./dm exec fastdds shm clean removes what killed processes left; in a container raise --shm-size",
         )
     return None

@@ -188,13 +188,17 @@ class Recorder:
         """Fetch the values of the names listed; they are recorded as if the node began now."""
         client, names = self._clients[path], listed.result().result.names
 
-        def fetch(answer: Any) -> None:  # where one of those asked for has no value, rclpy answers with none at all
-            types = zip(names, answer.result().types, strict=False)
-            known = [name for name, type_number in types if type_number != ParameterType.PARAMETER_NOT_SET]
-            client.get_parameters(known).add_done_callback(lambda answer: keep(known, answer.result().values))
+        # Where one of those asked for has no value any more, rclpy answers with none at all: it is asked again.
+        def fetch(answer: Any) -> None:
+            if len(types := answer.result().types) == len(names):
+                of = zip(names, types, strict=True)
+                known = [name for name, type_number in of if type_number != ParameterType.PARAMETER_NOT_SET]
+                client.get_parameters(known).add_done_callback(lambda answer: keep(known, answer.result().values))
 
         def keep(known: Sequence[str], values: Sequence[Any]) -> None:
-            given = [Parameter(name=name, value=value) for name, value in zip(known, values, strict=False)]
+            if len(values) != len(known):
+                return
+            given = [Parameter(name=name, value=value) for name, value in zip(known, values, strict=True)]
             event = serialize_message(ParameterEvent(node=path, new_parameters=given))
             # What changes from when it was seen is told later, so the newer value stands.
             self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, event, self._seen[node]))
