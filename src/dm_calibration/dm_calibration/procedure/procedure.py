@@ -93,10 +93,12 @@ class Procedure:
         todo = [number for number, step in enumerate(steps) if not self._is_done(number, step)]
         if todo and self.outcome.records:
             self._go_on(todo[0])
-        for number in todo:
+        for number, planned in enumerate(steps):
+            if self._is_done(number, planned):
+                continue
             if number in self._plan.ends and self._enough(self.outcome):
                 break
-            self._do(steps[number], number)
+            self._do(planned, number)
         self._report(steps[-1].label, steps[-1].kind, len(steps))
         return self.outcome
 
