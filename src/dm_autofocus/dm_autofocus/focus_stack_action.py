@@ -86,8 +86,7 @@ class FocusStackAction(ProbeAction):
             sample = self._probe.measure(WHOLE)
             before, image = image, sample.image
             if stack.positions and (image.encoding, image.is_bigendian) != (before.encoding, before.is_bigendian):
-                text = f"the images changed their encoding from {before.encoding} to {image.encoding}"
-                raise Refusal(ErrorCode.INVALID_ARGUMENT, text)
+                raise ValueError(f"the images changed their encoding from {before.encoding} to {image.encoding}")
             if len({region.shape for region in sample.regions}) > 1:
                 raise ValueError("the images changed their size")
             stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))

@@ -186,7 +186,8 @@ class SettledShape(NamedTuple):
 
 def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     """The shape that stands; None = not one that was asked for as a curvature."""
-    values = {pair.key: pair.value for pair in getattr(health.get("focus_controller"), "values", ())}
+    controller = health.get("focus_controller")
+    values = {pair.key: pair.value for pair in controller.values} if controller is not None else {}
     if "curvature" not in values:
         return None
     curvature, age, bound, predicted = (float(values[name]) for name in ("curvature", "age", "bound", "predicted"))

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import largest_of
 from dm_calibration.hysteresis.actuator_weights import weights_of
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Rows
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
@@ -23,8 +22,6 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 #: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
 #: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
-
-Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

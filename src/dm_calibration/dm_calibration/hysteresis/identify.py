@@ -10,9 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit, Rows
 from dm_calibration.hysteresis.excitation import MAPS_PER_ACTUATOR
 from dm_calibration.hysteresis.own_laws import OwnFit, OwnLaws
 from dm_calibration.hysteresis.run import Run
@@ -21,8 +20,6 @@ from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Floats
 from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.model import CREEP_RATE_MAX
-
-Rows = NDArray[np.bool_]
 
 #: The smallest slope of a law that an open loop can invert safely.
 SLOPE_MIN = 0.1

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from dm_calibration.hysteresis.actuator_weights import SPREAD, alike, likeliest_spread, weights_of
-from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
+from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Rows
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
     PER_ELEMENT,
@@ -40,8 +39,6 @@ from dm_common import Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised, slope_min
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
-
-Rows = NDArray[np.bool_]
 
 #: Prior standard deviations of a Duhem operator's weight, and of that times the change of a coefficient of its slope.
 DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1

@@ -191,8 +191,8 @@ class Recorder:
         # Where one of those asked for has no value any more, rclpy answers with none at all: it is asked again.
         def fetch(answer: Any) -> None:
             if len(types := answer.result().types) == len(names):
-                of = zip(names, types, strict=True)
-                known = [name for name, type_number in of if type_number != ParameterType.PARAMETER_NOT_SET]
+                typed = zip(names, types, strict=True)
+                known = [name for name, type_number in typed if type_number != ParameterType.PARAMETER_NOT_SET]
                 client.get_parameters(known).add_done_callback(lambda answer: keep(known, answer.result().values))
 
         def keep(known: Sequence[str], values: Sequence[Any]) -> None:
