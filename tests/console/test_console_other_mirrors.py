@@ -128,8 +128,11 @@ def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, Stan
 
 def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn, str]) -> None:
     page = bench[0]
+    page.wait_for("Predicted residual")
+    before = page.find("Move", "button").rect
     page.enter("Curvature, 1/m", "0,02")
     page.wait_for("= +0.0400 dioptre")
+    assert page.find("Move", "button").rect == before, "nothing moves while a prediction is made"
     page.enter("Curvature, 1/m", "0.0")
 
 
@@ -176,6 +179,7 @@ def test_all_text_stands_out_from_its_ground(
     for title in DETAILS:
         page.unfold(title)
     page.enter("Recipes", "0")
+    page.wait_for("Predicted residual")
     move = page.find("Move", "button")
     wait_until(lambda: page.stands_still(move), 60, "button Move to stand still")  # what unfolds takes a moment
     before = move.rect

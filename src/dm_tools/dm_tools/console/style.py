@@ -48,6 +48,7 @@ details.card:not([open]) { gap: 0; }
 .reason { font-size: .85rem; color: var(--doubt); }
 .refused { color: var(--error); font-weight: 600; }
 .figures { font-variant-numeric: tabular-nums; }
+.prediction { min-height: 2.6rem; }
 .scroll { max-height: 340px; overflow: auto; width: 100%; font-size: .82rem; }
 .scroll table { width: 100%; border-collapse: collapse; }
 .scroll td { padding: 1px 8px 1px 0; vertical-align: top; overflow-wrap: anywhere; white-space: nowrap; }

@@ -39,7 +39,8 @@ class FocusCard:
                 self._conic = DecimalField("Conic constant", 0.0).classes("w-28")
                 self._power = Line("text figures")
             self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO).props('inline aria-label="Mode"')
-            self._prediction = Line("text figures", live=True)
+            with ui.element("div").classes("prediction"):
+                self._prediction = Line("text figures", live=True)
             with ui.element("div").classes("line"):
                 self._move = ActionButton("Move", session.begin, "Move", operations.move, self._request, "move_focus")
                 self._flatten = ActionButton("Flatten", session.begin, "Flatten", operations.flatten, outline=True)
