@@ -42,7 +42,7 @@ def fast_bench(folder: Path, seed: int, source: Path | None = None) -> dict[str,
     elsewhere.
     """
     config = bench_config(folder, "off", 0.0, seed, 0.0, source)
-    config["virtual_bench"]["interferometer.pixels"] = 472
+    config["virtual_bench"]["interferometer.pixels"] = 236
     config["calibration"] |= {"write_report": False, "settle_time": 0.02}
     config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     return config

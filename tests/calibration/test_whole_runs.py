@@ -50,6 +50,8 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
     save_config(config, first)
     options = ["calibrate", "--plan", "poke-check"]
     with own_domain() as domain, ForkedSuite(config, tmp_path, domain):
+        with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
+            client.wait_until_active()
         done = subprocess.run(
             [sys.executable, "-m", "dm_tools", *options, "--config", str(first), "--write", str(second)],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
@@ -139,7 +141,7 @@ def test_a_bench_whose_processes_are_all_interrupted_at_once_ends_in_order(tmp_p
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
     """The demo as a user runs it, with a folder, figures and a smaller camera of the test's; reports: elsewhere."""
     config = load_config(shared_config("bench.yaml"))
-    config["virtual_bench"]["interferometer.pixels"] = 472
+    config["virtual_bench"]["interferometer.pixels"] = 354
     config["calibration"]["write_report"] = False
     bench = tmp_path / "bench.yaml"
     save_config(config, bench)
