@@ -167,6 +167,17 @@ def test_a_name_in_square_brackets_is_no_markup(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out == f"dropped {said}\nnext: {said}\n"
 
 
+def test_what_is_next_is_said_for_the_mirror_that_was_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    said = "./dm check --forget, ./dm focus 0.02; if not, ./dm up --config f.yaml"
+    output.next_step(said)
+    output.next_step(said, "lab/left")
+    alone, left = capsys.readouterr().out.splitlines()
+    assert alone == f"next: {said}"
+    there = "--namespace lab/left"
+    assert left == f"next: ./dm check {there} --forget, ./dm focus {there} 0.02; if not, ./dm up --config f.yaml"
+    parsed(*left.split("./dm ")[2].split(";")[0].split())
+
+
 def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)

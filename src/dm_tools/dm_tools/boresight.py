@@ -107,4 +107,4 @@ def run_boresight(
     else:
         console.print("in use until the node ends; for its next start (--write FILE does it) put into its file:")
         console.print(parameters, markup=False, highlight=False)
-    next_step("./dm focus 0.02")
+    next_step("./dm focus 0.02", namespace)

@@ -104,9 +104,15 @@ def fail(message: str) -> None:
     errors.print(message, soft_wrap=True, markup=False)
 
 
-def next_step(text: str) -> None:
+def in_namespace(text: str, namespace: str) -> str:
+    """`text` with the namespace given to each command in it that asks running nodes."""
+    option = rf"\g<0> --namespace {namespace}"
+    return re.sub(r"\./dm (?!demo|doctor|up)[a-z]+", option, text) if namespace else text
+
+
+def next_step(text: str, namespace: str = "") -> None:
     """The last line of a command: what one does after it."""
-    console.print(f"[dim]next: {text}[/]", soft_wrap=True)
+    console.print(f"[dim]next: {in_namespace(text, namespace)}[/]", soft_wrap=True)
 
 
 def progress_bar(steady: bool = True) -> Progress:

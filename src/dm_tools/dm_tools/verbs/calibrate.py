@@ -282,4 +282,4 @@ def calibrate(
     if dry_run:
         next_step("the same without --dry-run measures")
     elif then := after_run(result, write):
-        next_step(then)
+        next_step(then, namespace)

@@ -96,20 +96,24 @@ def check(
     write_json(json, {"check": figures(response, *names) | {"promised_nm": nanometres(promised)}})
     if not (response.accepted or forget):
         cure = "as the message says, or ./dm calibrate" if "./dm check --" in response.message else "./dm calibrate"
-        next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}")
+        next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}", namespace)
         raise typer.Exit(1)
     if not (forget or without or kept(promised, response.max_zernike)):
-        next_step("one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate")
+        again = "one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate"
+        next_step(again, namespace)
         raise typer.Exit(1)
     if without:
         again = "ask for the shape again: the command that stands counts on all actuators; ./dm status has the range"
-        next_step("the same command, but for --dry-run, goes on so; nothing is changed yet" if dry_run else again)
+        next_step(
+            "the same command, but for --dry-run, goes on so; nothing is changed yet" if dry_run else again, namespace
+        )
         return
     if lost and not forget:
-        next_step("./dm degauss: then focus_controller knows the history too")
+        next_step("./dm degauss: then focus_controller knows the history too", namespace)
         return
     next_step(
         "./dm report writes what the calibration holds"
         if calibration.hysteresis.play_radius
-        else "./dm calibrate finds the hysteresis too, and promises far less than this"
+        else "./dm calibrate finds the hysteresis too, and promises far less than this",
+        namespace,
     )

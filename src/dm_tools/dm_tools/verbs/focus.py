@@ -42,7 +42,7 @@ def focus(
                 write_json(json, {"focus": [refused]})
             raise
     write_json(json, {"focus": [figures_of(state)]})
-    _show_next(state)
+    _show_next(state, namespace)
 
 
 def flatten(
@@ -58,7 +58,7 @@ def flatten(
     if state.applied:
         console.print(f"commanded{_held(state)}")
     write_json(json, {"focus": [figures_of(state)]})
-    _show_next(state)
+    _show_next(state, namespace)
 
 
 def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", json: JsonOption = None) -> None:
@@ -74,7 +74,7 @@ def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", 
     write_json(json, {"degauss": {"seconds": response.duration, "history_known": known}})
     if not known:
         raise typer.Exit(1)
-    next_step("./dm focus 0.02")
+    next_step("./dm focus 0.02", namespace)
 
 
 def _calibration(client: Any) -> Any:
@@ -103,13 +103,13 @@ def _held(state: Any) -> str:
     return " and is held against creep" if state.creep_held else ""
 
 
-def _show_next(state: Any) -> None:
+def _show_next(state: Any, namespace: str) -> None:
     if not state.applied:
         next_step("the same without --dry-run moves the mirror")
     elif not state.history_known:
-        next_step("./dm degauss, then ask again: the promise is narrower")
+        next_step("./dm degauss, then ask again: the promise is narrower", namespace)
     else:
-        next_step("./dm check compares the promise with a map, ./dm status says where the mirror stands")
+        next_step("./dm check compares the promise with a map, ./dm status says where the mirror stands", namespace)
 
 
 def figures_of(state: Any) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def measure(
         figures["pitch"] = _scale(info, coefficients, reference_sphere)
         then = "put the parameters into the parameter file; then take the sphere out"
     write_json(json, {"measure": figures})
-    next_step(then)
+    next_step(then, namespace)
 
 
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:

@@ -129,4 +129,4 @@ def recipes(
         withheld = "withholds its recipes: maps disagree, or an actuator does not follow"
         console.print(f"calibration {book.calibration_id} {withheld if book.degauss_steps else 'holds no recipes'}")
     write_json(json, {"calibration": book.calibration_id, **_figures(book)})
-    next_step(next_of(book))
+    next_step(next_of(book), namespace)

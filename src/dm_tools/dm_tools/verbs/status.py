@@ -7,7 +7,7 @@ from typing import Any
 from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
 from dm_common.optics.conic import range_text
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, in_namespace, nanometres, write_json
 from dm_tools.running_suite import (
     NEEDED,
     REPORT_S,
@@ -52,7 +52,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),
-        "next": _next(lacking, by, state, calibration, shape, capabilities),
+        "next": in_namespace(_next(lacking, by, state, calibration, shape, capabilities), namespace),
     }
     for name, text in rows.items():
         console.print(f"[bold]{name:12s}[/]{text}", soft_wrap=True)

@@ -162,7 +162,6 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
     from dm_client import DeformableMirrorClient
 
     started, late = time.monotonic(), False
-    option = f" --namespace {namespace}" if namespace else ""
     with DeformableMirrorClient(namespace) as client:
         while lacking := lacks(client.messages):
             if not late and time.monotonic() - started > LATE_S:
@@ -177,7 +176,7 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
         f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, {in_use}"
     )
     first = first_command(capabilities, file)
-    next_step(f"in another terminal: ./dm {first}{option}; ./dm status{option} says how things are")
+    next_step(f"in another terminal: ./dm {first}; ./dm status says how things are", namespace)
 
 
 def first_command(capabilities: Any, file: Path | None) -> str:
