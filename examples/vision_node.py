@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rclpy
 from dm_msgs.msg import FocusRequest, FocusState
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -47,5 +48,7 @@ if __name__ == "__main__":
     rclpy.init()
     try:
         rclpy.spin(VisionNode())
+    except (OpticsError, InvalidParameterTypeException) as error:  # a parameter that is no distance, or of another type
+        raise SystemExit(f"vision: {error}") from None
     except (KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, or whoever started it ends it
         pass

@@ -32,13 +32,14 @@ Written from the code by `./dm exec python -m studies.documentation.interfaces`;
 on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
 comment names none; signals are normalised, −1 to +1; sag is that of the surface, positive curvature is concave.
 
-A latched topic keeps its last message for those who come late. To see it, ask for both
-`ros2 topic echo --qos-durability transient_local --qos-reliability reliable /capabilities`: durability alone leaves
-best effort, which shows nothing before the next message.
+A latched topic keeps its last message for those who come late. `ros2 topic echo /capabilities` shows it, as it does
+with both of `--qos-durability transient_local --qos-reliability reliable`; durability alone leaves best effort, which
+shows nothing before the next message.
 
 Every field of a request or goal is checked before anything is done: NaN and infinity are answered with NOT_FINITE,
 numbers out of range with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters with
-INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME; the sentence names field, value and what is allowed.
+INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME, texts with control characters with INVALID_ARGUMENT; the
+sentence names field, value and what is allowed.
 Figures that were not worked out are NaN: those of a request refused before it was planned, or that a run did not come
 to. One refused for what was found out, a shape out of reach for example, tells what that was.
 

@@ -440,6 +440,7 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
     for code, id_in_use, ready in (
         (ErrorCode.NOT_CALIBRATED, "", False),
         (ErrorCode.DRIVER_UNAVAILABLE, "", False),
+        (ErrorCode.ELECTRONICS_UNREACHABLE, "c1", False),  # what is known of the history is not heard yet
         (ErrorCode.CALIBRATION_MISMATCH, "", True),  # it will not be taken, and the log says why
         (ErrorCode.OK, "c1", True),
     ):

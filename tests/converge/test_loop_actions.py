@@ -30,7 +30,7 @@ from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_types import Moment, Order
 from dm_controller.loop_actions import serve_loops
 from dm_controller.planning.target import FocusTarget
-from focus_bench import calibration, mirror_info
+from focus_bench import calibration, calibration_with_history, make_law, mirror_info
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from support import Observer, wait_until
 
@@ -151,6 +151,16 @@ def test_it_converges_and_tells_its_steps(rig: Rig) -> None:
     assert [step.step for step in feedback] == list(range(1, result.maps + 1))
     assert feedback[0].max_zernike > feedback[-1].max_zernike
     assert {step.curvature for step in feedback} == {0.02}
+
+
+def test_it_begins_where_a_move_would_go_and_another_solver_does_not(rig: Rig) -> None:
+    rig.host.focus.use(calibration_with_history(make_law()), mirror_info())
+    move = rig.host.order(FocusRequest(curvature=0.02), dry_run=True).move
+    assert move is not None and np.abs(move.signals - move.effective).max() > 0.01, "there is hysteresis to invert"
+    for method, wanted in (("", move.signals), ("bounded", move.effective)):
+        _, result = rig.run(converge(tolerance=1e-12, max_maps=1, method=method))
+        assert result.maps == 1
+        np.testing.assert_allclose(rig.bench.signals, wanted, atol=1e-6)
 
 
 def test_the_map_limit_ends_it_with_the_best_command(rig: Rig) -> None:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import rclpy
+from rclpy.action import ActionClient
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -273,6 +274,8 @@ class Connection:
             if not isinstance(error, ServiceCallError):
                 raise
             code, text = error.error_code, str(error)
-            if server is not None and (reason := lost()):
-                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {reason}"
+            client = self.clients[name]
+            served = client.server_is_ready if isinstance(client, ActionClient) else client.service_is_ready
+            if server is not None and (lost() or server.missing(served)):
+                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost() or server.text}"
             raise DeformableMirrorError(code, text) from error

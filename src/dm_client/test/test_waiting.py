@@ -127,6 +127,17 @@ def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -
         asked.measure()
 
 
+def test_a_node_that_never_came_is_named() -> None:
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    absent = SimpleNamespace(service_is_ready=lambda: False, srv_name="/measure")
+    never = Liveliness.__new__(Liveliness)
+    never.name, never.lost, never.starts, never._born = "interferometer", False, 0, -math.inf
+    asked._servers, asked.clients, asked._timeout_s = {"measure": never}, {"measure": absent}, 0.1
+    with pytest.raises(DeformableMirrorError, match="measure: the node interferometer is not running: start it") as told:
+        asked.measure()
+    assert told.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
+
+
 def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     asked._servers, asked.clients, asked._timeout_s = {}, dict.fromkeys(("set_signals", "move_focus")), 10.0

@@ -1,6 +1,7 @@
 """What a parameter, or a field of a request, may be: declared in tables, checked in one place. Knows no ROS."""
 
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -18,6 +19,8 @@ T = TypeVar("T")
 
 #: Most characters of a text that may name or describe anything.
 TEXT_MAX = 1000
+#: What a terminal takes for an order, in a text that others read in refusals and logs.
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,8 @@ class Value:
         """Raise unless `given` may be the value of `name`; the sentence names both, and what is allowed.
 
         Raises:
-            Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts),
-                UNKNOWN_NAME (choices, users in paths).
+            Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts), INVALID_ARGUMENT (control
+                characters), UNKNOWN_NAME (choices, users in paths).
         """
         if self.many:
             self._check_array(name, given)
@@ -116,6 +119,8 @@ class Value:
         if len(given) > TEXT_MAX:
             text = f"{name} has {len(given)} characters: must have at most {TEXT_MAX}"
             raise Refusal(ErrorCode.INVALID_LENGTH, text)
+        if _CONTROL.search(given):
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{name} = {given!r}: must hold no control characters")
         if self.choices and given not in self.choices:
             raise Refusal(ErrorCode.UNKNOWN_NAME, f"{name} = {given!r}: must be {self.allowed()}")
         if self.path:

@@ -68,6 +68,7 @@ def test_right_values_pass(changed: dict[str, Any]) -> None:
         ({"method": "x" * 5000}, ErrorCode.INVALID_LENGTH, f"method has 5000 characters: must have at most {TEXT_MAX}"),
         ({"labels": ["a"] * 3}, ErrorCode.INVALID_LENGTH, "labels has 3 values: must have 0 to 2"),
         ({"labels": ["x" * 5000]}, ErrorCode.INVALID_LENGTH, "labels[0] has 5000 characters"),
+        ({"labels": ["a\nb", "\x1b[31m"]}, ErrorCode.INVALID_ARGUMENT, r"labels[1] = '\x1b[31m': must hold no control"),
     ],
 )
 def test_wrong_values_are_named_with_what_is_allowed(changed: dict[str, Any], code: int, sentence: str) -> None:

@@ -163,7 +163,8 @@ class FocusController:
         limit, stamp = values["request_age"], stamp_ns(request.header.stamp)
         age = 1e-9 * (now.ns - stamp)
         if degaussed is None and limit and stamp and not -limit <= age <= limit:
-            raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
+            when = f"{age:.3f} s old" if age > 0.0 else f"stamped {-age:.3f} s ahead"
+            raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {when}; allowed: {limit:g} s (request_age)")
         REQUEST.check(request)
         target = FocusTarget(request.curvature, request.conic_constant, tuple(request.zernike))
         settle, budget = values["settle_time"], request.time_budget or values["time_budget"]

@@ -20,7 +20,7 @@ from dm_common.ros.worker import WorkerActionServer, WorkerGoal, wait_for_clock
 from dm_controller.focus_actions import FocusHost
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.planner import Move
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
@@ -100,13 +100,13 @@ class LoopBench(BenchServices):
             self._node.get_logger().warning(f"{name}: {text}")
         return OUTCOMES.get(code, "abort"), code, text
 
-    def target(self, request: FocusRequest) -> FocusTarget:
-        """The target of a request that could be carried out. Raises Refusal, as for a move."""
+    def move(self, request: FocusRequest) -> Move:
+        """The move that a request would make. Raises Refusal."""
         order = self._host.order(request, dry_run=True)
         if order.refusal is not None:
             raise order.refusal
         assert order.move is not None  # else it is refused
-        return order.move.target
+        return order.move
 
     def active_calibration(self) -> ActiveCalibration:
         """The calibration in use. Raises Refusal."""

@@ -343,9 +343,9 @@ def test_where_nothing_is_reachable_capabilities_say_so(bench: Bench) -> None:
 def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
     host = SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))
     loop = cast(Any, SimpleNamespace(_host=host))
-    assert LoopBench.target(loop, FocusRequest(curvature=0.01)).curvature == 0.01
+    assert LoopBench.move(loop, FocusRequest(curvature=0.01)).target.curvature == 0.01
     with pytest.raises(Refusal, match="reachable:") as refused:
-        LoopBench.target(loop, FocusRequest(curvature=9.0))
+        LoopBench.move(loop, FocusRequest(curvature=9.0))
     assert refused.value.error_code == ErrorCode.UNREACHABLE
     assert not (bench.commands or bench.outcomes)
 
@@ -363,7 +363,8 @@ def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None
         ({"zernike": [1.0] * 21}, ErrorCode.UNREACHABLE, "no curvature is reachable"),
         ({"mode": "7"}, ErrorCode.UNKNOWN_NAME, "mode = '7': must be one of empty, auto, direct, conditioned"),
         ({"time_budget": -1.0}, ErrorCode.OUT_OF_RANGE, "time_budget = -1.0: must be"),
-        ({"header": Header(stamp=time_message(1))}, ErrorCode.STALE, "header.stamp"),
+        ({"header": Header(stamp=time_message(1))}, ErrorCode.STALE, "s old; allowed: 1 s (request_age)"),
+        ({"header": Header(stamp=time_message(2**62))}, ErrorCode.STALE, "s ahead; allowed: 1 s (request_age)"),
         ({"mode": CONDITIONED}, ErrorCode.NOT_SUPPORTED, "no recipes"),
     ],
 )

@@ -62,6 +62,14 @@ def test_others_hear_who_holds_it_how_long_and_how_to_end_it(hold: MirrorHold, c
         hold.ask(Operation.HOLD, "autofocus")
 
 
+def test_a_renewal_keeps_what_it_does_not_say_anew(hold: MirrorHold, clock: Clock) -> None:
+    clock.now += 1.0
+    hold.ask(Operation.RENEW, "calibration")
+    assert "about 94 s to go: cancel its action" in hold.sentence
+    hold.ask(Operation.RENEW, "calibration", "the last maps", duration=11.0)
+    assert "about 10 s to go: the last maps" in hold.sentence
+
+
 def test_it_ends_soon_after_its_holder_died(hold: MirrorHold, clock: Clock) -> None:
     clock.now += 0.9 * LEASE_S
     hold.ask(Operation.RENEW, "calibration")

@@ -51,11 +51,22 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
     options = LoopOptions(  # 0 = as configured
         goal.tolerance or values["converge.tolerance"], goal.max_maps or values["converge.max_maps"]
     )
-    target = bench.target(goal.request)
+    move = bench.move(goal.request)
     solver = solver_of(bench.active_calibration(), goal.method)
+    # By the law of the actuators, unless another solver is to be tried, or they are to be degaussed on the way.
+    start = move.signals if not goal.method and move.degauss is None else None
     bench.check_ready()
     try:
-        found = converge(solver, target, bench, options, creep=_creep(bench), on_step=report, cancelled=bench.cancelled)
+        found = converge(
+            solver,
+            move.target,
+            bench,
+            options,
+            start=start,
+            creep=_creep(bench),
+            on_step=report,
+            cancelled=bench.cancelled,
+        )
     except Refusal as error:
         raise Refusal(error.error_code, f"{error}; the mirror holds the last command") from error
     best = found.best

@@ -91,6 +91,8 @@ class MirrorHold:
             now = self._clock()
             if current != holder:
                 self._since = now
+            elif operation == Operation.RENEW:  # what it does not say anew stays
+                purpose, duration = purpose or self._purpose, duration or self._duration
             self._holder, self._purpose, self._duration = holder, purpose, duration
             self._until = now + (lease or LEASE_S)
 

@@ -143,12 +143,12 @@ def only_suite(namespace: str) -> Iterator[None]:
 
 def lacks(messages: Mapping[str, Any]) -> str:
     """What keeps a suite that said `messages` (by topic) last from taking requests; "" = nothing."""
-    from dm_common.errors import ErrorCode
+    from dm_client.connection import RESTING
 
     state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
     if state is None or state.driver_state != state.STATE_ACTIVE:
         return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
-    if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
+    if capabilities is not None and capabilities.error_code in RESTING:
         return str(capabilities.message)
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
         return "calibration and focus_controller have not said yet what the mirror can do"

@@ -111,7 +111,8 @@ class FocusCard:
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
         self._text.show(
             f"Reachable {curvatures_text(*found)}.\n"
-            f"95 % bound on a coefficient beyond what is predicted: {capabilities.error_bound * 1e9:.1f} nm{extra}."
+            "95 % bound on a coefficient beyond what is predicted and creep adds: "
+            f"{capabilities.error_bound * 1e9:.1f} nm{extra}."
         )
         if found != self._range:
             self._range = found
