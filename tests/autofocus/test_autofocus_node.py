@@ -652,7 +652,9 @@ def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) 
     assert sorted(unexplained(done.stdout)) == []
 
 
-@pytest.mark.parametrize(("given", "said"), [("-1.0", "rest_distance = -1.0 m: must be above 0"), ("5", "rest_distance")])
+@pytest.mark.parametrize(
+    ("given", "said"), [("-1.0", "rest_distance = -1.0 m: must be above 0"), ("5", "rest_distance")]
+)
 def test_the_vision_node_refuses_what_is_no_distance_in_a_sentence(given: str, said: str, domain: int) -> None:
     node = Path(__file__).resolve().parents[2] / "examples" / "vision_node.py"
     command = [sys.executable, str(node), "--ros-args", "-p", f"rest_distance:={given}"]

@@ -444,7 +444,7 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
         (ErrorCode.CALIBRATION_MISMATCH, "", True),  # it will not be taken, and the log says why
         (ErrorCode.OK, "c1", True),
     ):
-        said["capabilities"] = Capabilities(error_code=code, calibration_id=id_in_use)
+        said["capabilities"] = Capabilities(error_code=code, calibration_id=id_in_use, message="said")
         assert (lacks(said) == "") == ready
     said |= {"calibration": Calibration(), "capabilities": Capabilities(error_code=ErrorCode.NOT_CALIBRATED)}
     assert lacks(said) == ""

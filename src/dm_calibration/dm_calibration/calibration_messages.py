@@ -82,9 +82,9 @@ def put_updates(
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    warm_error = kept.filter.warm_error(drift, temperature)
+    errors = kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)
     for promise in (message, message.hysteresis):  # no bound is below what maps have shown since one last agreed
-        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), warm_error)
+        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), *errors)
     message.revision = drift.revision
     message.checked = time_message(drift.checked_ns)
     message.creep_shown = drift.trust

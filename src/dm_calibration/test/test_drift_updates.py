@@ -25,6 +25,8 @@ from dm_calibration.recalibration.updates import InUse, RecalibrationManager, Ve
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import HASH, read_image, write_image
 from dm_common.atomic_write import StoreError
+from dm_common.hysteresis.creep_record import rested
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
 from steady_mirror import Floats, SteadyMirror
@@ -219,6 +221,23 @@ def test_an_actuator_that_stands_where_it_should_is_not_given_up(
     with pytest.raises(MapNotUsableError, match=r"actuator 7 stands at .*: this shape does not show that it fails"):
         updates.take(bench.measure("fine"), bench.settled(), without=[6])
     assert known(updates).revision == 0 and not known(updates).given_up
+
+
+def test_what_was_given_up_creeps_on_inside_the_bound(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    updates, settled = begun(made, tmp_path), bench.settled()
+    fallen = bench.signals.copy()
+    fallen[6] = -1.0
+    bench.apply(fallen)
+    assert updates.take(bench.measure("fallen"), settled, without=[6]).accepted
+    kept, law = in_use(updates), HysteresisModel.linear(0.01)
+    assert kept.filter.stuck_error(kept.drift) == 0.0, "nothing is known of its creep"
+    kept.filter._creep_law = law
+    message = calibration_message(kept.calibration, None, "mirror", 1.0)
+    put_updates(message, kept, np.nan, [], False)
+    now, hour = law.move(rested(law, fallen * 0.0, 0.0), fallen, 0.0), 3600.0
+    crept = (law.effective(law.advance(now, hour)) - law.effective(law.advance(now, 1.0)))[6]
+    further = np.abs(kept.calibration.fit.influence_zernike[3:, 6] * crept).max()
+    assert 0.3 * message.held_out_max_zernike < further < message.held_out_max_zernike
 
 
 def test_an_actuator_without_any_influence_is_not_given_up(made: Made, tmp_path: Path) -> None:
@@ -578,3 +597,19 @@ def test_what_a_map_shows_while_the_message_is_made_is_published_too(
     monkeypatch.setattr(MapListener, "_doubts", lambda _listener: [])
     listener.amend(calibration_message(in_use(updates).calibration, None, "mirror", 1.0))
     assert listener._dirty
+
+
+def test_where_an_actuator_stands_is_found_with_its_middle_out_of_view(
+    bench: SteadyMirror, made: Made, tmp_path: Path
+) -> None:
+    updates, settled = begun(made, tmp_path), bench.settled()
+    at = bench.signals.copy()
+    at[6] = -1.1
+    bench.apply(at)
+    measured, calibration = bench.measure("stuck"), made[1]
+    x, y = (place[6] / calibration.aperture_radius for place in (calibration.actuator_x, calibration.actuator_y))
+    hidden = np.hypot(measured.points.x - x, measured.points.y - y) < 0.1
+    assert hidden.any()
+    gaps = np.where(hidden, np.nan, measured.sag)
+    assert updates.take(replace(measured, sag=gaps), settled, without=[6]).accepted
+    assert known(updates).stuck[6] == pytest.approx(-1.1, abs=0.01)

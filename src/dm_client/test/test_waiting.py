@@ -17,6 +17,7 @@ from dm_msgs.srv import SetSignals
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError, connection
 from dm_common.errors import ErrorCode
+from dm_common.ros.qos import Liveliness
 
 
 def client(driver: int, able: int | None) -> DeformableMirrorClient:
@@ -133,7 +134,9 @@ def test_a_node_that_never_came_is_named() -> None:
     never = Liveliness.__new__(Liveliness)
     never.name, never.lost, never.starts, never._born = "interferometer", False, 0, -math.inf
     asked._servers, asked.clients, asked._timeout_s = {"measure": never}, {"measure": absent}, 0.1
-    with pytest.raises(DeformableMirrorError, match="measure: the node interferometer is not running: start it") as told:
+    with pytest.raises(
+        DeformableMirrorError, match="measure: the node interferometer is not running: start it"
+    ) as told:
         asked.measure()
     assert told.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
 

@@ -54,7 +54,11 @@ REACHABLE_TOLERANCE: Final = Parameter(
 PARAMETERS: Final = (
     AUTOSTART,
     REACHABLE_TOLERANCE,
-    Parameter("request_age", real(1.0, 0.0, 3600.0, "s"), "focus requests stamped longer ago, or as far ahead, are refused; 0 = never"),
+    Parameter(
+        "request_age",
+        real(1.0, 0.0, 3600.0, "s"),
+        "focus requests stamped longer ago, or as far ahead, are refused; 0 = never",
+    ),
     Parameter(
         "settle_time",
         real(SETTLE_S, 0.0, 60.0, "s"),

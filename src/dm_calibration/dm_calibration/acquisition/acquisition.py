@@ -206,7 +206,9 @@ class Acquisition:
                     raise trouble
             if now >= deadline:
                 raise trouble or Refusal(
-                    ErrorCode.MAP_TIMEOUT, f"the trigger command ended, but {path} did not appear in time"
+                    ErrorCode.MAP_TIMEOUT,
+                    f"the trigger command ended, but {path} did not appear in time (its ending is "
+                    f"trigger_output_suffix = {self.settings.trigger_suffix!r})",
                 )
             time.sleep(_POLL_OUTPUT_S)
 

@@ -62,10 +62,11 @@ CREEP_SLOPE = 0.3
 ROUNDS, ROUNDS_MAPS = 20, 300
 #: Maps for each actuator that tell how far actuators differ: of fewer, fitted so closely, too much is found.
 ASKED_MAPS = 5
-#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps, none of which
-#: leaves less than LEAST of it. Where more than a tenth would have to go and its Duhem operator is its own, it takes
-#: the common one first. One of many may fall where hardly a map shows it.
-SHRINKS, SHRUNK, LEAST = 4, 0.9, 0.7
+#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps. Where more
+#: than a tenth would have to go and its Duhem operator is its own, it takes the common one first. One of many may fall
+#: where hardly a map shows it: what would keep less than LEAST is drawn halfway to the mean law of the others, if no
+#: more than a share LOST of the actuators, or one, is so.
+SHRINKS, SHRUNK, LEAST, LOST = 8, 0.9, 0.7, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +171,12 @@ class OwnLaws:
             patterns[-1, worse] = 0.0
         for _ in range(SHRINKS):
             share = self._share_kept(law)
-            flat = share < 1.0
-            if not flat.any() or share.min() < LEAST:
+            flat, lost = share < 1.0, share < LEAST
+            if not flat.any() or lost.all() or lost.sum() > max(1.0, LOST * actuators):
                 break
-            patterns[1:, flat] *= 0.999 * share[flat]
+            patterns[:, lost] = 0.5 * (patterns[:, lost] + patterns[:, ~lost].mean(axis=1, keepdims=True))
+            less = flat & ~lost
+            patterns[1:, less] *= 0.999 * share[less]
             changed = changed | flat
             law = self._law(patterns, creep, slope)
             crept = self._with_creep(features, creep, patterns)

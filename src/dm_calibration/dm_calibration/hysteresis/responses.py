@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
-from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
@@ -57,6 +57,14 @@ class Reduction:
         """(..., R) m rms of coefficients (..., K) m and sag (..., P) m."""
         low = coefficients[..., PISTON_TILT:] * self._scale
         return np.concatenate((low, self._beyond(sag) @ self._patterns.T), axis=-1)
+
+    def fill(self, sag: Floats) -> Floats:
+        """`sag` (P,) m less piston and tilt, where it is NaN as terms and patterns that fit the other points say."""
+        if np.isnan(sag).any():
+            modes = np.column_stack((basis(self._points.x, self._points.y), (self._patterns / self._weight).T))
+            fitted = modes @ weighted_fit(sag[None], modes, self._points.weight)[0]
+            sag = np.where(np.isfinite(sag), sag, fitted)
+        return remove_piston_tilt(sag[None], self._points)[0]
 
     def expand(self, values: Floats) -> tuple[Floats, Floats]:
         """Coefficients (K,) m and sag (P,) m of `values` (R,), without piston and tilt."""

@@ -56,7 +56,7 @@ class Forecast:
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
-        source = ", by data sheets and mirrors drawn at random, some of them twice as far off" if drawn else ""
+        source = ", by data sheets and mirrors drawn at random; others may be several times as far off" if drawn else ""
         reached = told_from(self.max_zernike, until if missed else 0.0)
         right = f"moves then right to {reached} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"

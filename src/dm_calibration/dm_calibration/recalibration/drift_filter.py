@@ -50,6 +50,8 @@ EVIDENCE_KEPT = 0.97
 DISPLACED_SIGMAS = 4.0
 #: Gains of actuators that hardly show are not known worse than this.
 GAIN_SIGMA_MAX = 0.05
+#: One that is given up creeps on for so many decades of time after the map, as after a move across the range.
+STUCK_DECADES = 2.0
 
 
 class _Innovation(NamedTuple):
@@ -228,7 +230,7 @@ class DriftFilter:
         changed = self.changed(drift, temperature)
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         zernike_error = measured.coefficients - changed.zernike_offset - changed.influence_zernike @ effective
-        sag_error = fill_gaps(measured.sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
+        sag_error = self.reduction.fill(measured.sag - predicted_sag)
         predicted, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
         used = drift.trust * predicted + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
@@ -252,6 +254,12 @@ class DriftFilter:
         coefficients = np.abs(self.reduction.expand(drift.thermal[1:])[0])
         coefficients += np.abs(drift.thermal[0]) * np.abs(self._fit.influence_zernike).sum(axis=1)
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
+
+    def stuck_error(self, drift: Drift) -> float:
+        """Bound of what actuators that do not move any more change of a coefficient since they creep on, m."""
+        gone = np.isfinite(drift.stuck)
+        crept = STUCK_DECADES * self._creep_law.creep_rate * (1.0 + np.abs(drift.stuck[gone]))
+        return float((np.abs(self._fit.influence_zernike[PISTON_TILT:, gone]) @ crept).max())
 
     def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:
         """The influence function with gains and figure as far as what `drift` has found of them is borne out.

@@ -24,6 +24,8 @@ LEAST_AUTHORITY = 0.01
 #: Ridge on the signals, as a share of a typical actuator's rms response. On a simulated PDM30-37 it costs less than
 #: 1 % of the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
+#: The same where an actuator has no effect: else all others go where it stands, to the end of their range, to hide it.
+RIDGE_SHARE_STUCK = 0.1
 #: How much more tilt counts than the sag beyond the terms, where it is held: less than the coefficients, so that where
 #: a limit binds the shape has precedence.
 TILT_WEIGHT = 10.0
@@ -183,7 +185,8 @@ class CalibratedMirror:
             tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
             self.tilt = tilt if np.abs(tilt).max() > LEAST_TILT * response.max() else None
         self.matrix = self.rows(Shape(model.influence_zernike, model.influence_sag), self.tilt)
-        self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
+        share = RIDGE_SHARE if response.all() else RIDGE_SHARE_STUCK
+        self.ridge = (share * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
