@@ -38,8 +38,8 @@ shows nothing before the next message.
 
 Every field of a request or goal is checked before anything is done: NaN and infinity are answered with NOT_FINITE,
 numbers out of range with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters with
-INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME, texts with control characters with INVALID_ARGUMENT; the
-sentence names field, value and what is allowed.
+INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME, texts with control characters other than tabs and
+line ends with INVALID_ARGUMENT; the sentence names field, value and what is allowed.
 Figures that were not worked out are NaN: those of a request refused before it was planned, or that a run did not come
 to. One refused for what was found out, a shape out of reach for example, tells what that was.
 

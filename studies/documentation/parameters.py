@@ -32,7 +32,7 @@ def parameters_page() -> str:
         "Written from the code by `./dm exec python -m studies.documentation.parameters`; a test keeps it true.",
         "A whole number will do for a float (`300` for `300.0`). With a parameter that is wrong or missing a node",
         "stays unconfigured, says so, and takes it by `ros2 param set`; with one that is misspelt, until it is started",
-        "anew without it. `virtual_bench`, which is no lifecycle node, ends. What is marked *live* changes at any time.",
+        "anew without it. `virtual_bench`, which is no lifecycle node, ends. What is marked *live* changes any time.",
         "The rest changes of driver and interferometer until they are configured, and of calibration, focus controller",
         "and autofocus while they are inactive.",
         "",

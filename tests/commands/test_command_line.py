@@ -176,6 +176,8 @@ def test_what_is_next_is_said_for_the_mirror_that_was_asked(capsys: pytest.Captu
     there = "--namespace lab/left"
     assert left == f"next: ./dm check {there} --forget, ./dm focus {there} 0.02; if not, ./dm up --config f.yaml"
     parsed(*left.split("./dm ")[2].split(";")[0].split())
+    there = "ros2 lifecycle set /left/pdm_driver activate, then ./dm doctor --namespace left again; ./dm exec true"
+    assert output.in_namespace(there.replace("/left", "").replace(" --namespace left", ""), "left") == there
 
 
 def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:
@@ -444,7 +446,7 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
         (ErrorCode.CALIBRATION_MISMATCH, "", True),  # it will not be taken, and the log says why
         (ErrorCode.OK, "c1", True),
     ):
-        said["capabilities"] = Capabilities(error_code=code, calibration_id=id_in_use, message="said")
+        said["capabilities"] = Capabilities(error_code=code, calibration_id=id_in_use)
         assert (lacks(said) == "") == ready
     said |= {"calibration": Calibration(), "capabilities": Capabilities(error_code=ErrorCode.NOT_CALIBRATED)}
     assert lacks(said) == ""

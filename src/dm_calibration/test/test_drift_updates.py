@@ -599,6 +599,18 @@ def test_what_a_map_shows_while_the_message_is_made_is_published_too(
     assert listener._dirty
 
 
+def test_a_wide_gap_of_a_mirror_that_is_well_is_no_surprise(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for turn in np.linspace(0.0, 2 * np.pi, 6):
+        updates = begun(made, tmp_path / f"{turn:.1f}")
+        bench.apply(rng.uniform(-0.5, 0.5, bench.mirror.actuators))
+        measured = bench.measure("in part")
+        hidden = measured.points.x * np.cos(turn) + measured.points.y * np.sin(turn) > 0.3
+        assert hidden.mean() > 0.25
+        gaps = np.where(hidden, np.nan, measured.sag)
+        assert updates.take(replace(measured, sag=gaps), bench.settled()).accepted
+
+
 def test_where_an_actuator_stands_is_found_with_its_middle_out_of_view(
     bench: SteadyMirror, made: Made, tmp_path: Path
 ) -> None:

@@ -276,6 +276,6 @@ class Connection:
             code, text = error.error_code, str(error)
             client = self.clients[name]
             served = client.server_is_ready if isinstance(client, ActionClient) else client.service_is_ready
-            if server is not None and (lost() or server.missing(served)):
-                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost() or server.text}"
+            if server is not None and (reason := lost() or (server.text if server.missing(served) else "")):
+                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {reason}"
             raise DeformableMirrorError(code, text) from error

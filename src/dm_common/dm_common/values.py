@@ -20,7 +20,7 @@ T = TypeVar("T")
 #: Most characters of a text that may name or describe anything.
 TEXT_MAX = 1000
 #: What a terminal takes for an order, in a text that others read in refusals and logs.
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,10 @@ class Value:
             text = f"{name} has {len(given)} characters: must have at most {TEXT_MAX}"
             raise Refusal(ErrorCode.INVALID_LENGTH, text)
         if _CONTROL.search(given):
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{name} = {given!r}: must hold no control characters")
+            raise Refusal(
+                ErrorCode.INVALID_ARGUMENT,
+                f"{name} = {given!r}: must hold no control characters but tabs and line ends",
+            )
         if self.choices and given not in self.choices:
             raise Refusal(ErrorCode.UNKNOWN_NAME, f"{name} = {given!r}: must be {self.allowed()}")
         if self.path:

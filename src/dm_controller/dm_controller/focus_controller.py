@@ -34,10 +34,9 @@ from dm_controller.planning.choice import Degauss, PlanningContext, choose_move,
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import REQUEST, FocusTarget
 
-#: How often a held shape is checked while no correction can be due sooner, s.
-SLOW_PERIOD_S = 1.0
-#: How often the estimate of the actuators is published while the mirror moves, s of wall time.
-ESTIMATE_PERIOD_S = 0.25
+#: How often a held shape is checked while no correction can be due sooner, s, and how often the estimate of the
+#: actuators is published while the mirror moves, s of wall time.
+SLOW_PERIOD_S, ESTIMATE_PERIOD_S = 1.0, 0.25
 
 
 class FocusController:

@@ -57,7 +57,7 @@ PARAMETERS: Final = (
     Parameter(
         "request_age",
         real(1.0, 0.0, 3600.0, "s"),
-        "focus requests stamped longer ago, or as far ahead, are refused; 0 = never",
+        "focus requests stamped longer ago, or further ahead, are refused; 0 = never",
     ),
     Parameter(
         "settle_time",

@@ -51,6 +51,23 @@ def carried_out(
     return action._carry_out(handle)
 
 
+@pytest.mark.parametrize("holder", ["", "calibration"])
+def test_who_was_superseded_hears_how_to_keep_others_off(monkeypatch: pytest.MonkeyPatch, holder: str) -> None:
+    none: Any = None
+    handle: Any = SimpleNamespace(
+        request=SimpleNamespace(holder=holder, take_over=False), is_cancel_requested=False, publish_feedback=print
+    )
+    server = SimpleNamespace(preempted=lambda _handle: False)
+    monkeypatch.setattr(degauss_action, "WorkerActionServer", lambda *_arguments, **_keywords: server)
+    gate = CommandGate(MirrorHold(lambda: 0.0), lambda _text, _took_over: None)
+    move = Move(Kind.DEGAUSS, none)
+    move.finish(Outcome.SUPERSEDED)
+    monkeypatch.setattr(gate, "attempt", lambda *_arguments: (none, move))
+    outcome, code, text = degauss_action.DegaussAction(none, gate, {})._carry_out(handle)
+    assert (outcome, code) == ("abort", ErrorCode.PREEMPTED)
+    assert ("hold_mirror keeps others off" in text) == (not holder)
+
+
 def test_a_goal_that_was_overtaken_moves_nothing(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = Writer(Outcome.REACHED)
     assert carried_out(hold, writer, monkeypatch, overtaken=True)[:2] == ("abort", ErrorCode.PREEMPTED)

@@ -66,8 +66,15 @@ def test_a_renewal_keeps_what_it_does_not_say_anew(hold: MirrorHold, clock: Cloc
     clock.now += 1.0
     hold.ask(Operation.RENEW, "calibration")
     assert "about 94 s to go: cancel its action" in hold.sentence
-    hold.ask(Operation.RENEW, "calibration", "the last maps", duration=11.0)
+    hold.ask(Operation.RENEW, "calibration", "the last maps", duration=11.0, lease=60.0)
     assert "about 10 s to go: the last maps" in hold.sentence
+    hold.ask(Operation.RENEW, "calibration")
+    clock.now += 59.0
+    assert hold.sentence.endswith("60 s: the last maps; take_over takes it from there")
+    clock.now += 2.0
+    assert not hold.holder
+    hold.ask(Operation.RENEW, "calibration")  # late, and nobody came between
+    assert hold.sentence.startswith("calibration has held the mirror for 62 s: the last maps")
 
 
 def test_it_ends_soon_after_its_holder_died(hold: MirrorHold, clock: Clock) -> None:

@@ -106,8 +106,10 @@ def fail(message: str) -> None:
 
 def in_namespace(text: str, namespace: str) -> str:
     """`text` with the namespace given to each command in it that asks running nodes."""
-    option = rf"\g<0> --namespace {namespace}"
-    return re.sub(r"\./dm (?!demo|doctor|up)[a-z]+", option, text) if namespace else text
+    if not namespace:
+        return text
+    text = text.replace("lifecycle set /", f"lifecycle set /{namespace}/")
+    return re.sub(r"\./dm (?!(?:demo|exec|up)\b)[a-z-]+", rf"\g<0> --namespace {namespace}", text)
 
 
 def next_step(text: str, namespace: str = "") -> None:

@@ -205,11 +205,8 @@ class Acquisition:
                 elif trouble is not None and now - since >= self.settings.stable_time:
                     raise trouble
             if now >= deadline:
-                raise trouble or Refusal(
-                    ErrorCode.MAP_TIMEOUT,
-                    f"the trigger command ended, but {path} did not appear in time (its ending is "
-                    f"trigger_output_suffix = {self.settings.trigger_suffix!r})",
-                )
+                text = f"the trigger command ended, but {path} did not appear in time (ending: trigger_output_suffix)"
+                raise trouble or Refusal(ErrorCode.MAP_TIMEOUT, text)
             time.sleep(_POLL_OUTPUT_S)
 
     @contextmanager

@@ -26,7 +26,7 @@ SLOPE_MIN = 0.1
 #: A simpler candidate is taken when its held-out error is at most this much larger.
 PARSIMONY = 1.03
 #: Own laws are tried of a kind whose common ones have a held-out error at most this much larger than the least.
-NEAR = 1.3
+NEAR = 1.15
 #: Where a run has fewer other maps than so many per actuator, or tests in its first half, so that it may end early,
 #: each half of the test maps is predicted with the other half in the fit. Without any, moves in use lie far outside
 #: what so few maps show: 5 to 10 nm in the median of mirrors after 100 maps, where the final fit errs by 3.

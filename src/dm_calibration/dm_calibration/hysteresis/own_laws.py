@@ -62,10 +62,11 @@ CREEP_SLOPE = 0.3
 ROUNDS, ROUNDS_MAPS = 20, 300
 #: Maps for each actuator that tell how far actuators differ: of fewer, fitted so closely, too much is found.
 ASKED_MAPS = 5
-#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in so many steps. Where more
-#: than a tenth would have to go and its Duhem operator is its own, it takes the common one first. One of many may fall
-#: where hardly a map shows it: what would keep less than LEAST is drawn halfway to the mean law of the others, if no
-#: more than a share LOST of the actuators, or one, is so.
+#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in up to so many steps. Where
+#: more than a tenth would have to go and its Duhem operator is its own, it takes the common one first. One of many may
+#: fall where hardly a map shows it: a law that would keep less than LEAST is drawn halfway to the mean of the others
+#: instead, and its Duhem operator to none. Where more than one, and more than a share LOST, are so, they stay, to be
+#: refused.
 SHRINKS, SHRUNK, LEAST, LOST = 8, 0.9, 0.7, 0.1
 
 
@@ -174,7 +175,9 @@ class OwnLaws:
             flat, lost = share < 1.0, share < LEAST
             if not flat.any() or lost.all() or lost.sum() > max(1.0, LOST * actuators):
                 break
-            patterns[:, lost] = 0.5 * (patterns[:, lost] + patterns[:, ~lost].mean(axis=1, keepdims=True))
+            others = patterns[:, ~lost].mean(axis=1, keepdims=True)
+            others[self._linear.stop :] = 0.0
+            patterns[:, lost] = 0.5 * (patterns[:, lost] + others)
             less = flat & ~lost
             patterns[1:, less] *= 0.999 * share[less]
             changed = changed | flat

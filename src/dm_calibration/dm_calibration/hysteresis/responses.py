@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
-from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
@@ -21,6 +21,9 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 SCATTER_MIN = 1e-11
 #: Patterns weaker than this share of the strongest are noise.
 WEAKEST_PATTERN = 0.03
+#: Points without data are filled by the others where these are so many of them; amplitudes are drawn to 0 by this share
+#: of what a whole map says of them.
+FILLED_MIN, FILL_RIDGE = 0.9, 1e-3
 
 
 class Reduction:
@@ -59,11 +62,19 @@ class Reduction:
         return np.concatenate((low, self._beyond(sag) @ self._patterns.T), axis=-1)
 
     def fill(self, sag: Floats) -> Floats:
-        """`sag` (P,) m less piston and tilt, where it is NaN as terms and patterns that fit the other points say."""
-        if np.isnan(sag).any():
-            modes = np.column_stack((basis(self._points.x, self._points.y), (self._patterns / self._weight).T))
-            fitted = modes @ weighted_fit(sag[None], modes, self._points.weight)[0]
-            sag = np.where(np.isfinite(sag), sag, fitted)
+        """`sag` (P,) m less piston and tilt, where it is NaN as terms and patterns that fit the other points say.
+
+        A wide gap hides too much of some of them: it is filled with a plane.
+        """
+        known = np.isfinite(sag)
+        if known.mean() < FILLED_MIN:
+            sag = fill_gaps(sag[None], np.zeros((1, len(sag))), self._points)[0]
+        elif not known.all():
+            modes = np.column_stack((self._terms, self._patterns.T))
+            drawn = np.where(np.arange(modes.shape[1]) < PISTON_TILT, 0.0, FILL_RIDGE)
+            shown = modes[known]
+            amplitudes = np.linalg.solve(shown.T @ shown + np.diag(drawn), shown.T @ (self._weight * sag)[known])
+            sag = np.where(known, sag, modes @ amplitudes / self._weight)
         return remove_piston_tilt(sag[None], self._points)[0]
 
     def expand(self, values: Floats) -> tuple[Floats, Floats]:

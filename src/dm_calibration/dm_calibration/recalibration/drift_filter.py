@@ -40,17 +40,16 @@ from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 DAY_S = 86400.0
-#: Least variance of a value that is laid to its map's noise, as a share of what the calibration's maps scatter.
-NOISE_SHARE_MIN = 0.1
-#: The same in m^2, for maps without any noise.
-NOISE_MIN = 1e-24
+#: Least variance of a value that is laid to its map's noise, as a share of what the calibration's maps scatter, and
+#: in m^2, for maps without any noise.
+NOISE_SHARE_MIN, NOISE_MIN = 0.1, 1e-24
 #: What evidence counts for after one more map: it is of the last thirty maps or so.
 EVIDENCE_KEPT = 0.97
 #: An actuator that fails stands further from where it should than this many standard deviations.
 DISPLACED_SIGMAS = 4.0
-#: Gains of actuators that hardly show are not known worse than this.
-GAIN_SIGMA_MAX = 0.05
-#: One that is given up creeps on for so many decades of time after the map, as after a move across the range.
+GAIN_SIGMA_MAX = 0.05  # gains of actuators that hardly show are not known worse
+#: One given up creeps on as after a move across the range, for so many decades of time: with the allowance that every
+#: bound has (1.4), and a map some ten seconds after it failed, for about two hours.
 STUCK_DECADES = 2.0
 
 
@@ -237,7 +236,8 @@ class DriftFilter:
         # What the calibration itself does not know of its influence function, beyond gains.
         leverage = effective @ self._fit.signal_covariance @ effective
         expected = design @ drift.covariance @ design.T + (1.0 + repeat) ** 2 * self._law
-        expected += (1.0 + leverage) * np.diag(self._noise)
+        creeping = 0.5 * self._gain * self._creeping_on(drift)
+        expected += (1.0 + leverage) * np.diag(self._noise) + creeping @ creeping.T
         if np.isnan(temperature):  # what it has been seen to do may have happened
             unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
             expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
@@ -256,10 +256,12 @@ class DriftFilter:
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
 
     def stuck_error(self, drift: Drift) -> float:
-        """Bound of what actuators that do not move any more change of a coefficient since they creep on, m."""
-        gone = np.isfinite(drift.stuck)
-        crept = STUCK_DECADES * self._creep_law.creep_rate * (1.0 + np.abs(drift.stuck[gone]))
-        return float((np.abs(self._fit.influence_zernike[PISTON_TILT:, gone]) @ crept).max())
+        """Bound of what actuators given up change of a coefficient since they creep on, m; 0 without a law of that."""
+        return float((np.abs(self._fit.influence_zernike[PISTON_TILT:]) @ self._creeping_on(drift)).max())
+
+    def _creeping_on(self, drift: Drift) -> Floats:
+        """(N,) bound of the effective signal by which actuators given up creep on, 0 of the others."""
+        return STUCK_DECADES * self._creep_law.creep_rate * np.nan_to_num(1.0 + np.abs(drift.stuck))
 
     def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:
         """The influence function with gains and figure as far as what `drift` has found of them is borne out.

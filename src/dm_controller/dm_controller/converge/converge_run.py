@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from dm_msgs.action import Converge
+from dm_msgs.msg import FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles
@@ -51,18 +52,18 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
     options = LoopOptions(  # 0 = as configured
         goal.tolerance or values["converge.tolerance"], goal.max_maps or values["converge.max_maps"]
     )
-    move = bench.move(goal.request)
+    bench.move(goal.request)  # refused before anything is waited for
     solver = solver_of(bench.active_calibration(), goal.method)
-    # By the law of the actuators, unless another solver is to be tried, or they are to be degaussed on the way.
-    start = move.signals if not goal.method and move.degauss is None else None
     bench.check_ready()
+    goal.request.mode = FocusRequest.MODE_DIRECT  # it goes from where the mirror stands, by the law of the actuators
+    move = bench.move(goal.request)
     try:
         found = converge(
             solver,
             move.target,
             bench,
             options,
-            start=start,
+            start=None if goal.method else move.signals,
             creep=_creep(bench),
             on_step=report,
             cancelled=bench.cancelled,

@@ -91,7 +91,8 @@ class DegaussAction:
                     )
                 )
         if ended is not Outcome.REACHED:
-            cure = "; hold_mirror keeps others off: give its holder to this goal" if ended is Outcome.SUPERSEDED else ""
+            open_to_all = ended is Outcome.SUPERSEDED and not handle.request.holder
+            cure = "; hold_mirror keeps others off: give its holder to this goal" if open_to_all else ""
             return "abort", CODE_OF_OUTCOME[ended], ended.value + cure
         too_little = f"; it takes the whole range and {DEGAUSS_STEPS_MIN} of them or more to make the history known"
         swings = f"{move.steps} half-swings in {time.monotonic() - began:.1f} s"

@@ -41,7 +41,7 @@ class MirrorHold:
         self._lock = threading.RLock()
         # The holder stays until somebody else moves the mirror, also when the lease has run out: see `holder`.
         self._holder = self._purpose = ""
-        self._since = self._until = self._duration = 0.0
+        self._since = self._until = self._duration = self._lease = 0.0
         self._evicted: dict[str, str] = {}  # whose hold was taken over and by whom, until they hold it again
 
     @property
@@ -86,15 +86,16 @@ class MirrorHold:
                 if holder == self._holder:
                     self._holder = ""
                 return
+            again = operation == Operation.RENEW and holder == self._holder  # lapsed or not: nobody came between
             self._evict(holder, holder)
             self._evicted.pop(holder, None)
             now = self._clock()
-            if current != holder:
+            if again:  # what it does not say anew stays
+                purpose, duration, lease = purpose or self._purpose, duration or self._duration, lease or self._lease
+            elif current != holder:
                 self._since = now
-            elif operation == Operation.RENEW:  # what it does not say anew stays
-                purpose, duration = purpose or self._purpose, duration or self._duration
-            self._holder, self._purpose, self._duration = holder, purpose, duration
-            self._until = now + (lease or LEASE_S)
+            self._holder, self._purpose, self._duration, self._lease = holder, purpose, duration, lease or LEASE_S
+            self._until = now + self._lease
 
     def check(self, holder: str, take_over: bool) -> bool:
         """Whether a command of `holder` ("" = nobody in particular) takes the mirror from somebody.

@@ -39,10 +39,11 @@ def doctor(
             console.print(f"{name}: {finding.problem}\n      cure: {finding.cure}", soft_wrap=True, markup=False)
     write_json(json, {"doctor": findings})
     if wrong := sum(bool(finding and finding["cure"] and not finding["note"]) for finding in findings.values()):
-        next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again")
+        next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again", namespace)
         raise typer.Exit(1)
     running = findings["nodes that are running"]
-    next_step("./dm status" if running and not running["cure"] else f"./dm up{f' --config {config}' if config else ''}")
+    start = f"./dm up{f' --config {config}' if config else ''}"
+    next_step("./dm status" if running and not running["cure"] else start, namespace)
 
 
 def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:

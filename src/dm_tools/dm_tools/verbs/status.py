@@ -134,7 +134,7 @@ def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any,
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
     if state is None or state.driver_state != state.STATE_ACTIVE:
         resting = state is not None and state.driver_state == state.STATE_INACTIVE
-        first = "`ros2 lifecycle set` activates it; " if resting else ""
+        first = "`ros2 lifecycle set /pdm_driver activate`; " if resting else ""
         return f"the driver must be active first: {first}./dm doctor --config FILE says what it lacks"
     if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
         return str(capabilities.message)

@@ -149,7 +149,7 @@ def lacks(messages: Mapping[str, Any]) -> str:
     if state is None or state.driver_state != state.STATE_ACTIVE:
         return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
     if capabilities is not None and capabilities.error_code in RESTING:
-        return str(capabilities.message)
+        return str(capabilities.message or "focus_controller takes no requests yet")
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
         return "calibration and focus_controller have not said yet what the mirror can do"
     if messages["calibration"].id and not (capabilities.calibration_id or calibration_refused(capabilities)):
