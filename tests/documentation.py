@@ -85,8 +85,8 @@ PLAIN = frozenset(
         r"\w+",
         "active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
         "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min needs newest none now "
-        "again doctor have long ok own pdf ready real running said sheets since soon start status taken terminal "
-        "config there things took typical "
+        "again doctor have long ok own pdf ready real running said several sheets since soon start status taken "
+        "terminal config there things took typical "
         "valid whole write writes written yaml yet",
     )
 )
