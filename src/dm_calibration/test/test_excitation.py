@@ -41,12 +41,17 @@ def test_the_last_moves_are_checks() -> None:
     assert commands.degaussed == (160, 180)
 
 
-def test_held_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> None:
+def test_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> None:
     mirror = make_mirror(rings=2)
     commands = excitation(mirror, 300)
     squares = mirror.x**2 + mirror.y**2
     lean = commands.signals @ (squares - squares.mean())
     held = (commands.dwell > 0.0) & ~commands.in_use
+    in_use = np.flatnonzero(commands.in_use & ~commands.check)
+    one_way, other_way = np.split(lean[in_use], [len(in_use) // 2])
+    assert (one_way > 0.0).mean() > 0.9
+    assert (other_way < 0.0).mean() > 0.9
+    assert 0.3 < (lean[commands.check] > 0.0).mean() < 0.7  # what the law is tested with bends either way
     first = np.arange(300) < np.median(np.flatnonzero(held))
     assert (lean[held & first] > 0.0).all()
     assert (lean[held & ~first] < 0.0).mean() > 0.9  # but for the one in the middle

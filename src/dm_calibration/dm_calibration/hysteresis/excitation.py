@@ -3,12 +3,13 @@
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
 sag shows N displacements per map, so one run serves all. As soon as these tell about where the mirror is flat, every
 other shape is as in use: of low orders, with random signals of each actuator on top, about the flat mirror. Actuators
-that flatten a figure then stand near an end of their range for long, where random shapes hardly come. Now and then a
-shape is held for creep to be seen: near a bowl in one half of the run, near its inverse in the other, so that creep
-over minutes shows too. Maps that are taken early show creep of the first second. The last fifth are moves as in use
-alone, kept to test the law that the others gave. They begin with a degauss, and where there are many another comes
-halfway. Only what follows shows the offset between demagnetised actuators and the mean of their loops; without it the
-fit puts the offset into the figure, and requests after a degauss are off by a constant.
+that flatten a figure then stand near an end of their range for long, where random shapes hardly come. These shapes bend
+the mirror one way in one half of the run and the other way in the other half: what it stands at in the mean of minutes
+is what shows creep over minutes. So do shapes that are held now and then, near a bowl in one half and near its inverse
+in the other. Maps that are taken early show creep of the first second. The last fifth are moves as in use alone, kept
+to test the law that the others gave. They begin with a degauss, and where there are many another comes halfway. Only
+what follows shows the offset between demagnetised actuators and the mean of their loops; without it the fit puts the
+offset into the figure, and requests after a degauss are off by a constant.
 """
 
 from dataclasses import dataclass
@@ -43,8 +44,8 @@ HELD_S = (1.0, 20.0)
 FLAT_KNOWN, IN_USE_EVERY, SCATTER = 2, 2, 0.3
 #: Random signals on top of the moves that test the law, likewise.
 CHECK_SCATTER = 0.03
-#: How far held shapes are drawn to a bowl.
-BOWL = 0.7
+#: How far held shapes are drawn to a bowl, and the least that those as in use bend one way, as a share of the most.
+BOWL, BENT = 0.7, 0.7
 #: Share of the maps that are taken early, and the share of the settle time after which.
 EARLY_SHARE, EARLY = 0.3, 0.2
 
@@ -108,7 +109,7 @@ def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> E
     number = np.arange(maps)
     check = number >= maps - checks
     in_use = check | ((number >= random) & (number % IN_USE_EVERY == 0))
-    shapes[in_use & ~check] = _as_in_use(mirror, int((in_use & ~check).sum()), SCATTER, rng)
+    shapes[in_use & ~check] = _as_in_use(mirror, int((in_use & ~check).sum()), SCATTER, rng, one_way=True)
     held = rng.random(maps) < HELD_SHARE
     shapes[held & ~in_use] = _bowls(mirror, shapes[held & ~in_use])
     low, high = np.log(HELD_S)
@@ -142,17 +143,31 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
     bowl = 2.0 * squares / (squares.max() or 1.0) - 1.0
     share = float(_gentle(mirror, bowl))
     bowl = share * bowl - (1.0 - share)  # its middle at the end of the range
-    sign = np.where(np.arange(len(shapes)) < len(shapes) // 2, 1.0, -1.0)
-    return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * sign[:, None] * bowl))
+    bent = _way(len(shapes))[:, None] * bowl
+    return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * bent))
 
 
-def _as_in_use(mirror: Mirror, count: int, scatter: float, rng: np.random.Generator) -> Floats:
-    """(count, N) bowls with some astigmatism, coma and `scatter` about any common level, inside the limits."""
+def _way(count: int) -> Floats:
+    """(count,) the sign of curvature of rows that bend one way in their first half and the other way in their second."""
+    return np.where(np.arange(count) < count // 2, 1.0, -1.0)
+
+
+def _as_in_use(
+    mirror: Mirror, count: int, scatter: float, rng: np.random.Generator, *, one_way: bool = False
+) -> Floats:
+    """(count, N) bowls with some astigmatism, coma and `scatter` about any common level, inside the limits.
+
+    Args:
+        one_way: they bend as :func:`_way` says; else either way at random.
+    """
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     reach = float(np.hypot(mirror.x, mirror.y).max()) or 1.0
     x, y = mirror.x / reach, mirror.y / reach
     patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
-    size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])
+    size = rng.uniform(-1.0, 1.0, (count, len(patterns)))
+    if one_way:
+        size[:, 0] = _way(count) * (BENT + (1.0 - BENT) * np.abs(size[:, 0]))
+    size *= np.array([0.7, 0.1, 0.1, 0.05])
     shapes = size @ patterns + scatter * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
     shapes *= _gentle(mirror, shapes)[:, None]
     shapes = np.clip(shapes, -1.0, 1.0)

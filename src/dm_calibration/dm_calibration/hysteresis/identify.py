@@ -25,8 +25,6 @@ from dm_common.hysteresis.model import CREEP_RATE_MAX
 SLOPE_MIN = 0.1
 #: A simpler candidate is taken when its held-out error is at most this much larger.
 PARSIMONY = 1.03
-#: Own laws are tried of a kind whose common ones have a held-out error at most this much larger than the least.
-NEAR = 1.15
 #: Where a run has fewer other maps than so many per actuator, or tests in its first half, so that it may end early,
 #: each half of the test maps is predicted with the other half in the fit. Without any, moves in use lie far outside
 #: what so few maps show: 5 to 10 nm in the median of mirrors after 100 maps, where the final fit errs by 3.
@@ -96,8 +94,8 @@ def identify(
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
-            hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all;
-            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next.
+            hysteresis as it has, and begins with the best common one of its kind; where it fades, with another if that
+            leaves much less; where it cannot be inverted then, with the next.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals that it is for.
@@ -154,11 +152,10 @@ def identify(
             consider(CandidateProblem(run, candidate, scatter))
         elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             common.sort(key=lambda scored: scored[0])
-            near = [fit for score, fit in common if score < NEAR * common[0][0]]
-            near = [fit for fit in near if fit.candidate.kind == candidate.kind]
-            if near and candidate.slopes:
-                near += [fit for fit in fading if all(fit is not other for other in near)]
-            for own, whole in _begun(run, candidate, near, scatter, train, slope_min):
+            starts = [fit for _, fit in common if fit.candidate.kind == candidate.kind]
+            if candidate.slopes:
+                starts += [fit for fit in fading if all(fit is not other for other in starts)]
+            for own, whole in _begun(run, candidate, starts, scatter, train, slope_min):
                 consider(own, whole)
                 if candidate.name not in refused:
                     break

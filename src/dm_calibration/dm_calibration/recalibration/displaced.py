@@ -123,6 +123,7 @@ def described(
     """
     if not displaced:
         return "bad map, or the mirror has changed"
+    sure = sorted(actuator for actuator, one in displaced.items() if one.probability >= SURE)
     shown, faults = list[str](), ""
     for actuator, (more, probability) in displaced.items():
         stands = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
@@ -131,19 +132,17 @@ def described(
         elif given_up[actuator]:
             stands += ", moves again"
         else:
-            faults += (fault := _fault(expected[actuator], more))
-            stands += fault
+            stands += (fault := _fault(expected[actuator], more))
+            faults += fault if actuator in sure else ""
         shown.append(f"actuator {actuator + 1} {stands} ({probability:.0%})")
-    found, numbers = ", ".join(shown), sorted(displaced)
-    if min(one.probability for one in displaced.values()) < SURE:
-        return found
-    if given_up[numbers].any():
+    found = ", ".join(shown)
+    if given_up[sure].any():
         return f"{found}; ./dm check --forget takes it back"
-    if silent[numbers].any():
+    if silent[sure].any():
         return f"{found}; ./dm calibrate measures it"
-    if "weakened" in faults or len(numbers) + given_up.sum() >= len(expected):
+    if not sure or "weakened" in faults or len(sure) + given_up.sum() >= len(expected):
         return found
-    without = " ".join(f"--without {actuator + 1}" for actuator in numbers)
+    without = " ".join(f"--without {actuator + 1}" for actuator in sure)
     return f"{found}; ./dm check {without} goes on without what does not move"
 
 

@@ -49,15 +49,15 @@ def run_calibration(client: Any, goal: Any) -> Any:
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
-        said, reached = "", 0.0
+        said, reached = ("", 0), 0.0
 
         def show(feedback: Any) -> None:
             nonlocal said, reached
             text = calibration_step(feedback)
-            phase = text.split()[0].rstrip(",")
-            if not console.is_terminal and phase != said:  # no bar is drawn: one line a phase
-                said = phase
-                console.print(f"calibration: {said}, step {feedback.step} of {feedback.steps}")
+            now = text.split()[0].rstrip(","), 10 * feedback.step // max(feedback.steps, 1)
+            if not console.is_terminal and now != said:  # no bar is drawn: one line a phase, and a tenth of it
+                said = now
+                console.print(f"calibration: {now[0]}, step {feedback.step} of {feedback.steps}")
             if feedback.reached_max_zernike != reached:
                 reached = feedback.reached_max_zernike
                 console.print(f"calibration: {reached_so_far(feedback)}")
