@@ -221,7 +221,9 @@ class FakeClient:
             (3.2e-9, {**left, "maps_left": 39}),
             (1.9e-9, {}),
         ):
-            show(Calibrate.Feedback(phase="hysteresis", reached_max_zernike=reached, **rest))
+            show(Calibrate.Feedback(phase="hysteresis", step=9, steps=452, reached_max_zernike=reached, **rest))
+        for step in range(10, 452):
+            show(Calibrate.Feedback(phase="hysteresis", step=step, steps=452, reached_max_zernike=1.9e-9))
         show(Calibrate.Feedback(phase="fit", step=452, steps=452, reached_max_zernike=1.9e-9))
         return Calibrate.Result(id="c1", maps=130, message="2 nm is reached: 1.9 nm", hysteresis_model="Preisach")
 
@@ -239,7 +241,12 @@ def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch
         "calibration: right to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
         "calibration: right to 1.9 nm so far",
     ]
-    assert "calibration: fit, step 452 of 452" in lines
+    said = [line for line in lines if ", step " in line]
+    tenths = [9, 46, 91, 136, 181, 226, 272, 317, 362, 407]
+    assert said == [
+        *(f"calibration: hysteresis, step {step} of 452" for step in tenths),
+        "calibration: fit, step 452 of 452",
+    ]
     assert (
         "when flat: repeatable to 2 nm (λ/316), absolute to 5.4 nm (λ/118), limited by the instrument's own error"
         in done.output

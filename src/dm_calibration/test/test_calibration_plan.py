@@ -101,13 +101,14 @@ def test_moves_in_use_follow_a_degauss_with_a_map_at_rest() -> None:
     assert len({step.label for step in plan.steps}) == len(plan.steps)
 
 
-def test_checks_lie_where_the_mirror_is_used() -> None:
+@pytest.mark.parametrize("kind", [StepKind.CHECK, StepKind.IN_USE])
+def test_shapes_as_in_use_lie_where_the_mirror_is_used(kind: StepKind) -> None:
     """About the shape that flattens it; all over the range of one that is flat at an end of it, as a membrane."""
     bench = SteadyMirror()
     fit = bench.calibrate().fit
     pulled = replace(fit, sag_offset=-fit.influence_sag @ np.full(fit.actuators, -0.9))
     plan = make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=150))
-    steps = [step for step in plan.steps if step.kind is StepKind.CHECK]
+    steps = [step for step in plan.steps if step.kind is kind]
     levels = {}
     for name, model in (("two-sided", fit), ("one-sided", pulled)):
         shapes = [shape_in_use(step, model, bench.mirror).signals for step in steps]

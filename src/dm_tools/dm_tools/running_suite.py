@@ -67,12 +67,12 @@ def promise(bound: float) -> str:
 
 def promise_of(calibration: Any) -> float:
     """m, 95 % bound on the largest coefficient error of a request but for creep, as a calibration's message tells."""
+    from dm_common.hysteresis.model import IN_USE
     from dm_common.messages import hysteresis_model_from
 
-    law = hysteresis_model_from(calibration.hysteresis)
-    if law is None:
+    if hysteresis_model_from(calibration.hysteresis) is None:
         return float(calibration.held_out_max_zernike)
-    return float(law.in_use * calibration.hysteresis.held_out_max_zernike)
+    return float(IN_USE * calibration.hysteresis.held_out_max_zernike)
 
 
 def unknown_history(capabilities: Any) -> str:

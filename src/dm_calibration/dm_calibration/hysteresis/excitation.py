@@ -3,13 +3,13 @@
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
 sag shows N displacements per map, so one run serves all. As soon as these tell about where the mirror is flat, every
 other shape is as in use: of low orders, with random signals of each actuator on top, about the flat mirror. Actuators
-that flatten a figure then stand near an end of their range for long, where random shapes hardly come. These shapes bend
-the mirror one way in one half of the run and the other way in the other half: what it stands at in the mean of minutes
-is what shows creep over minutes. So do shapes that are held now and then, near a bowl in one half and near its inverse
-in the other. Maps that are taken early show creep of the first second. The last fifth are moves as in use alone, kept
-to test the law that the others gave. They begin with a degauss, and where there are many another comes halfway. Only
-what follows shows the offset between demagnetised actuators and the mean of their loops; without it the fit puts the
-offset into the figure, and requests after a degauss are off by a constant.
+that flatten a figure then stand near an end of their range for long, where random shapes hardly come. The first half of
+these shapes bend the mirror one way, the second the other way: what it stands at in the mean of minutes is what shows
+creep over minutes. So do random shapes that are held now and then: the first half of them near a bowl, the second near
+its inverse. Maps that are taken early show creep of the first second. The last fifth are moves as in use alone, kept to
+test the law that the others gave. They begin with a degauss, and where there are many another comes halfway. Only what
+follows shows the offset between demagnetised actuators and the mean of their loops; without it the fit puts the offset
+into the figure, and requests after a degauss are off by a constant.
 """
 
 from dataclasses import dataclass
@@ -97,7 +97,10 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
 
 
 def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
-    """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted."""
+    """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted.
+
+    Each part bends both ways, for a few shapes each: of creep over minutes it shows little.
+    """
     return _part(mirror, maps, seed, 0, wide=False)
 
 
@@ -148,7 +151,7 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
 
 
 def _way(count: int) -> Floats:
-    """(count,) the sign of curvature of rows that bend one way in their first half and the other way in their second."""
+    """(count,) the sign of the curvature of shapes of which each half bends one way."""
     return np.where(np.arange(count) < count // 2, 1.0, -1.0)
 
 

@@ -112,8 +112,7 @@ def identify(
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
-    common: list[tuple[float, LawFit]] = []
-    fading: list[LawFit] = []  # common ones, those that cannot be inverted too
+    common: list[tuple[float, LawFit]] = []  # own laws that fade may begin with one that cannot be inverted, too
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
 
@@ -124,10 +123,10 @@ def identify(
         nonlocal best
         name = problem.candidate.name
         whole = whole or problem.fit(train)
-        if not whole.candidate.own and whole.candidate.slopes:
-            fading.append(whole)
         if flat := _too_flat(run, whole, slope_min):
             refused[name] = flat
+            if not whole.candidate.own and whole.candidate.slopes:
+                common.append((np.inf, whole))
             return
         if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
             refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not tell its creep"
@@ -153,8 +152,6 @@ def identify(
         elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             common.sort(key=lambda scored: scored[0])
             starts = [fit for _, fit in common if fit.candidate.kind == candidate.kind]
-            if candidate.slopes:
-                starts += [fit for fit in fading if all(fit is not other for other in starts)]
             for own, whole in _begun(run, candidate, starts, scatter, train, slope_min):
                 consider(own, whole)
                 if candidate.name not in refused:

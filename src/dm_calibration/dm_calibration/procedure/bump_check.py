@@ -17,8 +17,8 @@ from dm_common.values import live_parameter, real
 
 #: An aperture found on a map may wander by so many pixels.
 _WANDER_PX = 1.5
-#: Actuators that moved together err together: more than errors of each by its own add up to. A run that is drawn to a
-#: bowl in one half and to its inverse in the other leaves 1.3 to 1.6 times as much.
+#: Actuators that moved together err together: more than errors of each by its own add up to. A run whose held
+#: shapes alone lean to a bowl in one half and to its inverse in the other left 1.3 to 1.6 times as much.
 _TOGETHER = 2.0
 
 

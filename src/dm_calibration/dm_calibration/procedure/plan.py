@@ -23,9 +23,8 @@ NEXT_PART, PART_STEP = 0.25, 20
 LAST_PART_ENDS = 420
 #: Share of the neighbour limit that shapes as in use may take up: rounding must not break it.
 IN_USE_ROOM = 0.999
-#: Share of the range from mid range to an end from which on a mirror that is flat there is one-sided; and by how much
-#: its shapes as in use spread further than those about mid range, to reach both ends.
-ONE_SIDED, LEVELS_WIDER = 0.5, 1.5
+#: Share of the range from mid range to an end from which on a mirror that is flat there is one-sided.
+ONE_SIDED = 0.5
 
 
 class PlanKind(StrEnum):
@@ -192,9 +191,11 @@ def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Ste
     room = 0.5 * (limits.high - limits.low)
     if abs((flat - mirror.rest).mean()) > ONE_SIDED * room:
         away = step.signals - mirror.rest
-        level = float(np.clip(LEVELS_WIDER * away.mean(), -IN_USE_ROOM * room, IN_USE_ROOM * room))
         pattern = away - away.mean()
-        share = (IN_USE_ROOM * room - abs(level)) / max(float(np.abs(pattern).max()), 1e-12)
+        size = max(float(np.abs(pattern).max()), 1e-12)
+        # The level is as far from mid range as in the room that the pattern leaves; the pattern takes what is left.
+        level = IN_USE_ROOM * room * float(np.clip(away.mean() / max(room - size, 1e-12), -1.0, 1.0))
+        share = (IN_USE_ROOM * room - abs(level)) / size
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)
     target = model.influence_sag @ (step.signals - mirror.rest)
     return replace(step, signals=limits.scaled(surfaces.solve_shape(target, model, mirror, inside)[0])[0])

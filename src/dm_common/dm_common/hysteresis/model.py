@@ -32,8 +32,8 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis, horner
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
 #: The most creep per decade of time that a law may have.
 CREEP_RATE_MAX = 0.2
-#: How much more a request may err, where there is hysteresis, than the held-out moves of the calibration, which follow
-#: each other within seconds: requests, which are held for longer, err 1.2 to 2.6 times as much.
+#: How much more a request may err than the held-out moves of the calibration, which follow each other within seconds:
+#: requests, which are held for longer, err 1.2 to 2.6 times as much.
 IN_USE = 1.4
 
 
@@ -143,11 +143,6 @@ class HysteresisModel:
     def has_history(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
         return bool((self.play_radius > 0.0).any()) or self.fading is not None or self.creep_rate > 0.0
-
-    @property
-    def in_use(self) -> float:
-        """What the error of held-out moves is multiplied by for what requests are promised."""
-        return IN_USE if self.has_history else 1.0
 
     @cached_property
     def is_identity(self) -> bool:

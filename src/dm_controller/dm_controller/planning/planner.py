@@ -19,7 +19,7 @@ from dm_msgs.msg import FocusRequest
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
-from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.hysteresis.model import IN_USE, HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
@@ -255,7 +255,7 @@ class Planner:
         """
         if error is None:
             found, model = self.hysteresis, self.mirror.model
-            error = model.held_out_max_zernike if found is None else self.law.in_use * found.held_out_max_zernike
+            error = model.held_out_max_zernike if found is None else IN_USE * found.held_out_max_zernike
         return math.hypot(error, 0.0 if known else self._unknown_history[0])
 
     def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:

@@ -55,7 +55,7 @@ def run_calibration(client: Any, goal: Any) -> Any:
             nonlocal said, reached
             text = calibration_step(feedback)
             now = text.split()[0].rstrip(","), 10 * feedback.step // max(feedback.steps, 1)
-            if not console.is_terminal and now != said:  # no bar is drawn: one line a phase, and a tenth of it
+            if not console.is_terminal and now != said:  # no bar is drawn: a line for each phase and tenth
                 said = now
                 console.print(f"calibration: {now[0]}, step {feedback.step} of {feedback.steps}")
             if feedback.reached_max_zernike != reached:
