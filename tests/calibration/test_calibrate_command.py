@@ -6,6 +6,7 @@ import math
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +25,7 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.procedure.forecast import GoodEnough
 from dm_client import DeformableMirrorError
 from dm_common.errors import ErrorCode
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
 from dm_tools.verbs import calibrate as verb
@@ -152,6 +153,7 @@ def test_of_a_file_for_two_mirrors_the_namespace_says_which(tmp_path: Path) -> N
     [
         ("Preisach, each actuator its own", plays(), "2.8 nm (95 % bound"),
         ("linear", HysteresisModel.linear(), "2.8 nm (95 % bound"),
+        ("linear", replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES), "2.8 nm (95 % bound"),
         ("linear", None, "none while it is not in use"),
     ],
 )

@@ -118,7 +118,7 @@ def test_a_mirror_that_does_not_drift_is_not_made_worse(
     assert updates.begin(simulation.calibration) == ""
     rng = np.random.default_rng(43)
     errors = []
-    for _ in range(12):
+    for _ in range(48):
         simulation.bench.time += 30 * 86400.0
         simulation.night(rng)
         measured = simulation.measurement(simulation.bench.take_map())
@@ -127,7 +127,7 @@ def test_a_mirror_that_does_not_drift_is_not_made_worse(
         errors.append([simulation.error(fit, standing.effective) for fit in fits])
         assert updates.take(measured, standing).accepted
     without, kept = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert kept < 1.03 * without
+    assert kept < 1.02 * without
 
 
 def test_maps_of_the_nights_keep_the_calibration_true(simulation: AgeingSimulation, tmp_path: Path) -> None:

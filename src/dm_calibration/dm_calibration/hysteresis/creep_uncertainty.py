@@ -48,7 +48,7 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     errors = np.einsum("mjd,md->mj", together, left / scatter)
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
-    shared = np.linalg.inv(evidence / excess + np.linalg.inv(prior))
+    shared = _posterior(evidence / excess, prior)
     # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.
     # It takes the place of one of those three: it does not follow them, so the others show that pattern. Three
     # actuators or fewer that show anything at all do not make a plane.
@@ -59,8 +59,19 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     weight = np.zeros(len(gains))
     weight[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)
     prior = _prior(law, OWN, OWN_CORRELATION, OWN_POSITION)
-    each = np.einsum("mjn,mkn,n->njk", seen, seen, weight, optimize=True) + np.linalg.inv(prior)
-    return np.stack((shared, np.linalg.inv(each).mean(axis=0)))
+    each = np.einsum("mjn,mkn,n->njk", seen, seen, weight, optimize=True)
+    return np.stack((shared, _posterior(each, prior).mean(axis=0)))
+
+
+def _posterior(evidence: Floats, prior: Floats) -> Floats:
+    """(..., F, F) covariance of weights with `prior` (F, F) that `evidence` (..., F, F) leaves.
+
+    In units of the prior, where no rounding makes it negative.
+    """
+    root = np.linalg.cholesky(prior)
+    size, axes = np.linalg.eigh(root.T @ evidence @ root)
+    left = root @ axes / np.sqrt(1.0 + np.maximum(size, 0.0))[..., None, :]
+    return np.asarray(left @ np.swapaxes(left, -1, -2))
 
 
 def _prior(law: HysteresisModel, spectrum: float, correlation: float, position: float) -> Floats:

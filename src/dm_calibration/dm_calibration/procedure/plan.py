@@ -193,7 +193,8 @@ def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Ste
         away = step.signals - mirror.rest
         pattern = away - away.mean()
         size = max(float(np.abs(pattern).max()), 1e-12)
-        # The level is as far from mid range as in the room that the pattern leaves; the pattern takes what is left.
+        # The step's level is some share of the room beside its pattern: here it is that share of the whole range, and
+        # the pattern takes what is left.
         level = IN_USE_ROOM * room * float(np.clip(away.mean() / max(room - size, 1e-12), -1.0, 1.0))
         share = (IN_USE_ROOM * room - abs(level)) / size
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)

@@ -54,10 +54,10 @@ def run_calibration(client: Any, goal: Any) -> Any:
         def show(feedback: Any) -> None:
             nonlocal said, reached
             text = calibration_step(feedback)
-            now = text.split()[0].rstrip(","), 10 * feedback.step // max(feedback.steps, 1)
-            if not console.is_terminal and now != said:  # no bar is drawn: a line for each phase and tenth
-                said = now
-                console.print(f"calibration: {now[0]}, step {feedback.step} of {feedback.steps}")
+            phase, tenth = text.split()[0].rstrip(","), 10 * feedback.step // max(feedback.steps, 1)
+            if not console.is_terminal and (phase, tenth) != said:  # no bar is drawn
+                said = phase, tenth
+                console.print(f"calibration: {phase}, step {feedback.step} of {feedback.steps}")
             if feedback.reached_max_zernike != reached:
                 reached = feedback.reached_max_zernike
                 console.print(f"calibration: {reached_so_far(feedback)}")
