@@ -52,22 +52,22 @@ def test_the_promise_is_kept_within_a_factor_of_two() -> None:
 
 
 def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
-    """The median of those drawn at random; before, 1.2 nm whatever the number of maps."""
+    """The median of those drawn at random."""
     mirror = SimulatedBench(SIMULATION).mirror
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
     found = forecast(plan, 0.5, None, mirror, until=2e-9)
     assert 1e-9 < found.max_zernike < 2e-9 and found.maps < len(plan.steps)
-    assert found.accuracy(2e-9, True).startswith(", moves then right to 2 nm (")
+    assert found.accuracy(2e-9, True).startswith(", moves then right to 1.9 nm (")
     whole = forecast(plan, 0.5, None, mirror, until=1e-12)
-    assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.26e-9, rel=0.02)
-    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.3 nm (")
+    assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.53e-9, rel=0.02)
+    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.5 nm (")
     assert (
         Forecast(170.0, 2.04e-9)
         .accuracy(2e-9, False)
         .startswith(", not expected to reach 2 nm: moves then right to 2.04 nm (")
     )
     short = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=100))
-    assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.1e-9, rel=0.1)
+    assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.6e-9, rel=0.1)
 
 
 def test_what_is_left_follows_from_what_is_reached() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.accuracy import expected_accuracy
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate, CandidateProblem
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
@@ -19,10 +18,8 @@ from dm_calibration.hysteresis.identify import ExcitationError, Identification, 
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run
-from dm_common import Floats
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.law_shape import slope_min
-from dm_common.optics.zernike import PISTON_TILT
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from linear_mirror import make_mirror
 
@@ -226,27 +223,6 @@ def test_time_that_runs_backwards_is_refused(rising: Run) -> None:
     time[7] = time[5]
     with pytest.raises(ValueError, match=r"map 8 is .* s before the map before it"):
         replace(rising, time=time)
-
-
-def each_by_itself(run: Run) -> Floats:
-    """An influence function by which each coefficient beyond tilt shows one actuator."""
-    return np.eye(PISTON_TILT + run.signals.shape[1])[:, PISTON_TILT:]
-
-
-def test_more_maps_promise_more() -> None:
-    promised = []
-    for maps in (80, 160, 320):
-        run, check = simulated_run("none", maps)
-        promised.append(expected_accuracy(run.signals, run.time, check, 1.0, each_by_itself(run)))
-    assert promised[0] > 1.2 * promised[1] > 1.44 * promised[2]
-
-
-def test_a_promise_needs_check_moves_and_enough_maps() -> None:
-    run, check = simulated_run("none", 60)
-    with pytest.raises(ValueError, match="no moves that test"):
-        expected_accuracy(run.signals, run.time, np.zeros_like(check), 1.0, each_by_itself(run))
-    with pytest.raises(ValueError, match="must be more than"):
-        expected_accuracy(run.signals[-15:], run.time[-15:], check[-15:], 1.0, each_by_itself(run))
 
 
 def test_each_half_of_the_checks_of_a_short_run_is_predicted_with_the_other_in_the_fit(

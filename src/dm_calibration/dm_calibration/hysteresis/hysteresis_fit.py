@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dm_calibration.hysteresis.accuracy import largest_of
 from dm_calibration.hysteresis.actuator_weights import weights_of
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Rows
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
@@ -22,6 +21,8 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 #: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
 #: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
+#: Draws for quantiles of the largest of many correlated errors.
+DRAWS = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ def fit_hysteresis(
         name=found.fit.candidate.name,
         law=law,
         zernike_sigma=sigma,
-        held_out_max_zernike=largest_of(covariance),
+        held_out_max_zernike=_largest_of(covariance),
         unknown_sigma=unknown_history_sigma(found.fit.law, *run.reach),
         maps=int(run.responses.usable.sum()),
         remarks=(*_remarks(found), *_left_out(maps, run)),
@@ -186,6 +187,12 @@ def _error_covariance(found: Identification, count: int, maps: MapSet) -> Floats
     rows = rows[np.isfinite(rows).all(axis=1)]
     size, axes = np.linalg.eigh(rows.T @ rows / len(rows) - np.diag(maps.noise_variance()))
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+
+
+def _largest_of(covariance: Floats) -> float:
+    """95 % quantile of the largest of D errors with `covariance` (D, D), in their unit."""
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
+    return float(np.quantile(np.abs(draws).max(axis=1), 0.95))
 
 
 def _remarks(found: Identification) -> tuple[str, ...]:

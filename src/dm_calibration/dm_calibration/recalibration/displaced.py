@@ -9,10 +9,13 @@ from scipy.linalg import solve_triangular
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.quality import NO_RESPONSE
-from dm_calibration.procedure.forecast import typical_response
+from dm_calibration.influence.registration import bumps
 from dm_calibration.recalibration.drift import Displaced
 from dm_common import Floats
-from dm_common.optics.zernike import PISTON_TILT
+from dm_common.geometry import pitch
+from dm_common.optics.piston_tilt import weighted_fit
+from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import PISTON_TILT, basis
 
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
 #: that fits noise best explains about 0.13.
@@ -22,6 +25,9 @@ DISPLACED_SIGMA = 0.5
 #: Smallest signal that tells a weak actuator from one that is displaced, and smallest move of one that showed no
 #: response in the calibration; what is left of the move of a dead one.
 TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
+#: What the data sheets of piezo mirrors say: rise of the surface over an actuator per unit signal, m, and the width of
+#: the bump, standard deviation in pitches.
+TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 #: Of this probability on it is named how to go on without what does not move.
 SURE = 0.9
 
@@ -43,6 +49,16 @@ def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -
     places = calibration.actuator_x / radius, calibration.actuator_y / radius
     coefficients, sag = typical_response(*places, calibration.fit.points)
     return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
+
+
+def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
+    """(N, 21) coefficients and (N, P) sag, m per unit signal, of actuators at x, y (N,), in radii of the aperture.
+
+    As the data sheet of a piezo mirror lets expect; piston and tilt of the sag are removed.
+    """
+    shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
+    sag = TYPICAL_RISE * size[:, None] * shape
+    return weighted_fit(sag, basis(points.x, points.y), points.weight), sag
 
 
 def displaced_actuators(
