@@ -1,7 +1,7 @@
-"""Weights of features of each actuator, drawn towards those that all actuators share.
+"""Least-squares weights of the features of each actuator, drawn towards weights that all actuators share.
 
-Of each feature the weights are a common one and what an actuator adds to it. Both are normal; how much actuators
-differ, relative to the common weights, is a number that the maps tell.
+The weight of a feature is a common value plus a deviation of the actuator. Both have normal priors; the ratio of their
+standard deviations is estimated from the maps.
 """
 
 from inspect import signature
@@ -12,34 +12,34 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from dm_common import Floats
 
-#: Residual of the solved weights, relative.
+#: Relative residual at which the iterative solution for the weights stops.
 SOLVED = 1e-5
-#: What `cg` calls that: SciPy 1.11, which Ubuntu 24.04 has, otherwise than later ones.
+#: Name of this tolerance as an argument of `cg`: SciPy 1.11, which Ubuntu 24.04 has, differs from later ones.
 _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
-#: Standard deviations between actuators, relative to that of the common weights, of which the likeliest is taken: 0.1
-#: or 0.2 on mirrors whose densities of relays are like each other's to 15 %, up to 0.8 where each is of its own.
+#: Candidate standard deviations between actuators, relative to that of the common weights. Likeliest are 0.1 or 0.2 on
+#: mirrors whose densities of relays agree to 15 %, up to 0.8 where each actuator has a density of its own.
 SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
-#: The one that is taken before they are asked, and where they are not.
+#: The value used before the likeliest is known, and where the maps are too few to find it.
 SPREAD = 0.1
-#: How many actuators at most, spread over the mirror, are asked, of 37 every second one: the time that this takes grows
-#: with the third power.
+#: Most actuators, spread over the mirror, that decide between SPREADS; of 37 every second one. The time this takes
+#: grows with the third power of their number.
 ASKED = 20
 
 
 def alike(actuators: int, spread: float) -> tuple[float, float]:
-    """What :func:`weights_of` takes where actuators share a common part and differ by `spread` of it."""
+    """`between` of :func:`weights_of` for actuators whose weights differ from the common ones by the share `spread`."""
     own = spread**-2.0
     return own, own / (actuators + spread**2)
 
 
 def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[float, float], begin: Floats) -> Floats:
-    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
+    """Least-squares weights w (F, N) of the features x (M, F, N): sum_fn w_fn x_mfn gains_nd = left_md.
 
-    The inverse of their prior covariance over actuators is own I - common 1 1'; features do not depend on each other.
-    Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
+    The inverse of the prior covariance over actuators is own I - common 1 1'; different features are independent.
+    Solved by conjugate gradients with a preconditioner that ignores the overlap of the actuators' responses.
 
     Args:
-        between: own, common.
+        between: own and common of the prior above.
         begin: (F, N) weights to begin with.
     """
     own, common = between
@@ -68,11 +68,11 @@ def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[flo
 
 
 def likeliest_spread(features: Floats, left: Floats, gains: Floats, weights: Floats) -> float:
-    """Which of SPREADS makes `left` likeliest, whatever the weights are ("evidence" in [39]).
+    """The one of SPREADS that makes `left` likeliest, integrated over all weights (the "evidence" in [39]).
 
     Args:
         features, left, gains: as :func:`weights_of`; `left` in standard deviations.
-        weights: (F, N) so far: those of actuators that are not asked stay.
+        weights: (F, N) so far; those of the actuators beyond ASKED are kept fixed.
     """
     asked = np.arange(features.shape[2]) % -(-features.shape[2] // ASKED) == 0
     left = left - np.einsum("mfn,fn->mn", features[..., ~asked], weights[:, ~asked]) @ gains[~asked]

@@ -2,8 +2,8 @@
 
 ``response = figure(t) + e H`` with the effective signal ``e = sum_f w_f x_f`` of features x (play operators, Duhem
 operator, each with its creep), one set of weights w for all actuators and the gains in H. It is bilinear: H and w are
-least-squares solutions in turn. The few numbers that enter otherwise (slope of the Duhem operator, creep rate) are
-found by Gauss-Newton around that (variable projection [14]).
+found by alternating least squares. The few parameters that enter nonlinearly (slope of the Duhem operator, creep rate)
+are found by Gauss-Newton around that (variable projection [14]).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisMo
 
 Rows = NDArray[np.bool_]
 
-#: Ridge on the weights, relative to their mean evidence: keeps neighbours alike where the data do not tell them apart.
+#: Ridge on the weights, relative to the mean diagonal of the normal matrix: smooths weights that data do not separate.
 RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
-#: They end sooner where no effective signal changes by more in a round: far below what a map can show.
+#: The rounds end early once no effective signal changes by more than this: far below what a map can show.
 SETTLED = 1e-6
-#: What makes the equations of the gains solvable where actuators hardly move, as a share of their evidence.
+#: Ridge on the gains, relative to the trace of their normal matrix: keeps it regular where actuators hardly move.
 SOLVABLE = 1e-13
-#: Evaluations of the Gauss-Newton iteration at most, from a guess, and from a fit to other rows: there and a step on.
+#: Most evaluations of the Gauss-Newton iteration: from a guess; from a fit to other rows (its result and one step).
 EVALUATIONS, EVALUATIONS_AGAIN = 20, 2
-#: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
-#: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
+#: Creep is set to 0 if it lowers the sum of squares, in units of the scatter, by less than CREEP_SHOWN or, without
+#: hysteresis, by less than the share CREEP_SHARE of that sum: slow drift of the figure looks like creep.
 CREEP_SHOWN, CREEP_SHARE = 10.0, 0.03
 
 
@@ -45,8 +45,8 @@ class Candidate:
     Attributes:
         name: of the class of laws.
         plays: number of play operators beside the signal itself.
-        powers: of their values.
-        slopes: coefficients of the Duhem operator's slope; 0 = no such operator.
+        powers: highest power of their values.
+        slopes: number of coefficients of the Duhem operator's slope; 0 = no such operator.
         own: each actuator has its own weights, drawn towards common ones (:mod:`~dm_calibration.hysteresis.own_laws`);
             its Duhem operator begins as that of the best common candidate that has one.
     """
@@ -85,7 +85,7 @@ CANDIDATES = (
     Candidate("Preisach, each actuator its own", 30, 10, 0, own=True),
     Candidate("Preisach and Duhem, each actuator its own", 30, 10, 4, own=True),
 )
-#: Those of one law for all actuators.
+#: The candidates with one law for all actuators.
 COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)
 
 
@@ -94,8 +94,8 @@ class LawFit:
     """A candidate fitted to some rows of a run.
 
     Attributes:
-        law: with effective signals that span in a full cycle of the run what signals do.
-        residual: (M, D) of all rows, those left out included; units of `Responses.values`.
+        law: normalised: in a full cycle over the range of the run, effective signals span as much as signals.
+        residual: (M, D) of all rows, including those left out of the fit; units of `Responses.values`.
     """
 
     candidate: Candidate
@@ -104,7 +104,7 @@ class LawFit:
 
 
 class CandidateProblem:
-    """One candidate on one run: features once, then fits to any rows."""
+    """One candidate on one run: its features are computed once, then fitted to any rows."""
 
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
@@ -115,10 +115,10 @@ class CandidateProblem:
         self._measured = run.responses.values / scatter
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
-        """Fit to the rows in `keep` (M,), from `start` or from a guess.
+        """Fit to the rows in `keep` (M,), starting from `start` or, without it, from a guess.
 
         Args:
-            evaluations: at most; None = as it usually takes.
+            evaluations: most evaluations of the residual; None = EVALUATIONS or EVALUATIONS_AGAIN.
         """
         slopes = self.candidate.slopes
         if start is None:
@@ -130,7 +130,7 @@ class CandidateProblem:
         def residual(nonlinear: Floats) -> Floats:
             try:
                 features = self._features(nonlinear)
-            except ValueError:  # a Duhem operator that leads nowhere
+            except ValueError:  # coefficients that give no valid Duhem operator
                 return np.full(int(keep.sum()) * self._measured.shape[1], 1e3)
             weights[0], left = self._solve(features, keep, weights[0])
             return np.asarray(left[keep].ravel())
@@ -190,7 +190,7 @@ class CandidateProblem:
 
 
 def _alternate(features: Floats, measured: Floats, weights: Floats) -> Floats:
-    """(F,) weights, solved for in turn with the gains, from `weights` on.
+    """(F,) weights by least squares, alternating with the gains and starting from `weights`.
 
     Args:
         features: (M, F, N) without what the figure explains.

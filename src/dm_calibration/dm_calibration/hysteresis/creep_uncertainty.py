@@ -1,10 +1,10 @@
-"""How well a run shows the creep spectrum.
+"""How well a run determines the creep spectrum.
 
-Creep much younger than a map, or much older than the run, follows from the smoothness of the spectrum alone; what is
-between, from the maps. To first order the errors of the weights are those of a Bayesian linear regression on the
-positions and what the creep elements have followed of them, with figure and gains as fitted. What the law does not
-hold, such as loops that widen with speed, all actuators do together, so that errors of the responses are not
-independent: the maps count for less, as far as what they leave goes the way of the features.
+Creep much younger than a map, or much older than the run, is known from the smoothness of the spectrum alone; creep in
+between is known from the maps. To first order the errors of the weights are those of a Bayesian linear regression on
+the positions and on the states of the creep elements, with figure and gains as fitted. Effects outside the law, such as
+loops that widen with speed, are common to all actuators, so the errors of the responses are not independent: the maps
+count for less, by as much as their residual exceeds independent errors along the features.
 """
 
 from dataclasses import replace
@@ -17,21 +17,21 @@ from dm_common import Floats
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT
 
-#: Prior of the elements' weights that all actuators share: standard deviation relative to the mean rate, and their
-#: correlation over elements. Creep may begin or end anywhere: none at all of an element is not unlikely.
+#: Prior of the element weights that all actuators share: standard deviation relative to the mean weight, and
+#: correlation length in elements. Creep may begin or end anywhere, so a weight of 0 must remain plausible.
 SHARED, SHARED_CORRELATION = 0.9, 2.0
-#: The same of what an actuator differs by: rather in its rate than in its spectrum.
+#: The same for the deviations of one actuator, which are in its rate rather than in the shape of its spectrum.
 OWN, OWN_CORRELATION = 0.12, 6.0
-#: Prior standard deviations of a position, relative: shared, and of each.
+#: Relative prior standard deviations of the weight of a position: common to all actuators, and of each actuator.
 POSITION, OWN_POSITION = 0.03, 0.009
 #: An actuator whose gains are less than this share of the largest is dead.
 DEAD = 0.01
 
 
 def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
-    """(2, 1 + J, 1 + J) covariances of the weights of position and creep elements that `run` leaves.
+    """(2, 1 + J, 1 + J) covariances of the weights of position and creep elements after the fit to `run`.
 
-    The first is of errors that all actuators share, the second of those of each by itself.
+    The first is of errors that all actuators share, the second of those of each by itself (mean over the actuators).
     """
     keep = run.responses.usable
     position, effective = run.follow(replace(law, creep_rate=0.0)), run.follow(law)
@@ -49,9 +49,9 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
     shared = _posterior(evidence / excess, prior)
-    # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.
-    # It takes the place of one of those three: it does not follow them, so the others show that pattern. Three
-    # actuators or fewer that show anything at all do not make a plane.
+    # Evidence of one actuator while all others are free; a dead one has none. Left out are the three patterns that no
+    # response holds, piston and tilt. Each dead actuator is a hidden pattern by itself and replaces one of these three,
+    # which the others cannot form without it. Three actuators or fewer with a response have no such pattern.
     moves = np.linalg.norm(gains, axis=1)
     alive = moves > DEAD * moves.max()
     hidden = max(PISTON_TILT if len(gains) > PISTON_TILT else 0, int((~alive).sum()))
@@ -64,9 +64,9 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
 
 
 def _posterior(evidence: Floats, prior: Floats) -> Floats:
-    """(..., F, F) covariance of weights with `prior` (F, F) that `evidence` (..., F, F) leaves.
+    """(..., F, F) posterior covariance of weights, from the covariance `prior` (F, F) and `evidence` (..., F, F).
 
-    In units of the prior, where no rounding makes it negative.
+    Computed in units of the prior, where rounding cannot make it negative.
     """
     root = np.linalg.cholesky(prior)
     size, axes = np.linalg.eigh(root.T @ evidence @ root)

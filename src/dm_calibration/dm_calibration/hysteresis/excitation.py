@@ -1,14 +1,14 @@
 """Commands that show hysteresis and creep of all actuators at once.
 
-Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
-sag shows N displacements per map, so one run serves all. As soon as these tell about where the mirror is flat, every
-other shape is as in use: of low orders, with random signals of each actuator on top, about the flat mirror. Actuators
-that flatten a figure then stand near an end of their range for long, where random shapes hardly come. The first half of
-these shapes bend the mirror one way, the second the other way: what it stands at in the mean of minutes is what shows
-creep over minutes. So do random shapes that are held now and then: the first half of them near a bowl, the second near
-its inverse. Maps that are taken early show creep of the first second. The last fifth are moves as in use alone, kept to
-test the law that the others gave. They begin with a degauss, and where there are many another comes halfway. Only what
-follows shows the offset between demagnetised actuators and the mean of their loops; without it the fit puts the offset
+Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order.
+A map measures the displacements of all N actuators, so one run serves all of them. Once the random shapes show roughly
+where the mirror is flat, every other shape is as in use: of low order, with random signals of each actuator on top,
+about the flat mirror. Actuators that flatten a figure then stay near an end of their range, where random shapes hardly
+come. Creep over minutes shows only if the mean shape over minutes is not flat: the first half of the shapes as in use
+bend the mirror one way, the second half the other way. Random shapes that are held now and then lie near a bowl, later
+near its inverse. Maps taken early show creep of the first second. The last fifth are moves as in use alone, kept to
+test the law found from the others. They begin with a degauss, and if they are many another comes halfway. Only maps
+after a degauss show the offset between demagnetised actuators and the mean of their loops; without them the fit puts it
 into the figure, and requests after a degauss are off by a constant.
 """
 
@@ -23,30 +23,30 @@ from dm_common.mirror import Mirror
 
 #: Share of the maps that test the law.
 CHECK_SHARE = 0.2
-#: From so many of them on a degauss comes halfway, too.
+#: Number of test maps from which on a second degauss is made halfway through them.
 CHECKS_MANY = 20
-#: Repeated maps of the mirror at rest, which tell the noise of a map.
+#: Repeated maps of the mirror at rest, which show the noise of a map.
 REPEATS = 8
 #: Fewest and most maps of a run, repeats not counted.
 MAPS_MIN, MAPS_MAX = 60, 2000
-#: Fewest maps for each actuator, of which each shows its gain and law beside those of all others.
+#: Fewest maps per actuator: each map contributes to the gains and laws of all actuators at once.
 MAPS_PER_ACTUATOR = 2
-#: Swings as a share of the range: with fewer full ones errors in use are larger (studies/comparison/NOTES.md).
+#: Swings as shares of the range: with fewer full swings errors in use are larger (studies/comparison/NOTES.md).
 SWINGS = (1.0, 1.0, 0.6, 0.3)
-#: Runs of so many maps have random signals up to the ends of the range, by levels that all actuators share. No map
-#: shows a level, so shorter runs have less of it: after 100 to 200 maps errors are up to three times smaller so.
+#: From this many maps on, random signals reach the ends of the range, by levels that all actuators share. No map shows
+#: a level, so shorter runs have less of it: after 100 to 200 maps that makes errors up to three times smaller.
 WIDE_LEVELS_FROM = 250
 #: Share of the shapes that are held, and for how long, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
-#: So many random shapes for each actuator tell where the mirror is flat; of the shapes after them one in so many is as
-#: in use, with random signals of up to so much, as a share of half the range, on top.
+#: Random shapes per actuator after which the flat mirror is known; of the shapes after them one in IN_USE_EVERY is as
+#: in use, with random signals of amplitude SCATTER on top, as a share of half the range.
 FLAT_KNOWN, IN_USE_EVERY, SCATTER = 2, 2, 0.3
-#: Random signals on top of the moves that test the law, likewise.
+#: Amplitude of the random signals on top of the moves that test the law, as a share of half the range.
 CHECK_SCATTER = 0.03
-#: How far held shapes are drawn to a bowl, and the least that those as in use bend one way, as a share of the most.
+#: Weight of the bowl in held random shapes; least bending of shapes as in use, as a share of the largest.
 BOWL, BENT = 0.7, 0.7
-#: Share of the maps that are taken early, and the share of the settle time after which.
+#: Share of the maps that are taken early, and the share of the settle time after which they are taken.
 EARLY_SHARE, EARLY = 0.3, 0.2
 
 
@@ -55,11 +55,11 @@ class Excitation:
     """Commands in order.
 
     Attributes:
-        signals: (M, N) legal shapes, repeats not included; of those as in use, what they bend a flat mirror by.
+        signals: (M, N) legal shapes, repeats not included; shapes as in use are relative to the flat mirror.
         dwell: (M,) s to hold each beyond the settle time before its map.
-        settle_share: (M,) of the settle time to wait.
-        in_use: (M,) which are as in use, those that test the law among them.
-        check: (M,) which test the law.
+        settle_share: (M,) share of the settle time to wait.
+        in_use: (M,) which shapes are as in use, including those that test the law.
+        check: (M,) which shapes test the law.
     """
 
     signals: Floats
@@ -76,7 +76,7 @@ class Excitation:
 
 
 def fewest_maps(actuators: int) -> int:
-    """The fewest maps that a law of so many actuators can be found from."""
+    """The fewest maps from which the law of this number of actuators can be found."""
     return max(MAPS_MIN, MAPS_PER_ACTUATOR * actuators)
 
 
@@ -84,8 +84,8 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     """`maps` commands for `mirror`; the same for the same seed.
 
     Raises:
-        TooFewMapsError: too few for so many actuators.
-        ValueError: too many.
+        TooFewMapsError: too few maps for the number of actuators.
+        ValueError: too many maps.
     """
     fewest = fewest_maps(mirror.actuators)
     if maps < fewest:
@@ -97,15 +97,15 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
 
 
 def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
-    """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted.
+    """`maps` further commands, checks included, to continue a run that is already long enough to be fitted.
 
-    Each part bends both ways, for a few shapes each: of creep over minutes it shows little.
+    Each part bends the mirror both ways, by a few shapes each, so it shows little of creep over minutes.
     """
     return _part(mirror, maps, seed, 0, wide=False)
 
 
 def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> Excitation:
-    """`maps` commands, of which `random` ones come before those as in use; levels are `wide` or not."""
+    """`maps` commands; shapes as in use begin after the first `random` ones; levels of random shapes may be `wide`."""
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
     shapes = np.vstack((_random(mirror, maps - checks, wide, rng), _as_in_use(mirror, checks, CHECK_SCATTER, rng)))
@@ -122,7 +122,7 @@ def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> E
 
 
 def _random(mirror: Mirror, count: int, wide: bool, rng: np.random.Generator) -> Floats:
-    """(count, N) signals of each actuator about a common level; where `wide`, all signals come nearly as often."""
+    """(count, N) random signals about a common level; `wide`: nearly uniform over the range of signals."""
     limits, half_range = mirror.limits, mirror.limits.half_range
     swing = rng.choice(SWINGS, (count, 1))
     own = swing * min(half_range, 0.5 * limits.neighbour_difference)
@@ -133,7 +133,7 @@ def _random(mirror: Mirror, count: int, wide: bool, rng: np.random.Generator) ->
 
 
 def _gentle(mirror: Mirror, shapes: Floats) -> Floats:
-    """(...,) what share of `shapes` (..., N), in half ranges, keeps neighbours near each other; at most 1."""
+    """(...,) factor, at most 1, that brings `shapes` (..., N), in half ranges, within the limit between neighbours."""
     a, b = mirror.limits.pairs.T
     steepest = mirror.limits.half_range * np.abs(shapes[..., a] - shapes[..., b]).max(axis=-1, initial=0.0)
     return np.asarray(np.minimum(1.0, 0.999 * mirror.limits.neighbour_difference / np.maximum(steepest, 1e-12)))
@@ -151,17 +151,17 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
 
 
 def _way(count: int) -> Floats:
-    """(count,) the sign of the curvature of shapes of which each half bends one way."""
+    """(count,) sign of the curvature: the first half of the shapes bends one way, the second the other way."""
     return np.where(np.arange(count) < count // 2, 1.0, -1.0)
 
 
 def _as_in_use(
     mirror: Mirror, count: int, scatter: float, rng: np.random.Generator, *, one_way: bool = False
 ) -> Floats:
-    """(count, N) bowls with some astigmatism, coma and `scatter` about any common level, inside the limits.
+    """(count, N) bowls with some astigmatism, coma and random `scatter` about a random level, inside the limits.
 
     Args:
-        one_way: they bend as :func:`_way` says; else either way at random.
+        one_way: the sign of the curvature is that of :func:`_way`; otherwise it is random.
     """
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     reach = float(np.hypot(mirror.x, mirror.y).max()) or 1.0
@@ -174,6 +174,6 @@ def _as_in_use(
     shapes = size @ patterns + scatter * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
     shapes *= _gentle(mirror, shapes)[:, None]
     shapes = np.clip(shapes, -1.0, 1.0)
-    # Of a plate the level is only piston; a membrane that all actuators pull is a sphere.
+    # On a plate the level is only piston; on a membrane, which all actuators pull, it makes a sphere.
     room = 1.0 - np.abs(shapes).max(axis=1, keepdims=True)
     return np.asarray(middle + half_range * (shapes + room * rng.uniform(-1.0, 1.0, (count, 1))))

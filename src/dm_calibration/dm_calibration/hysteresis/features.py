@@ -6,32 +6,32 @@ from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator, FadingHysteresis
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 
-#: Weight of each element of an even creep spectrum per unit of creep rate, and of all of them.
+#: Weight of one element of an even creep spectrum per unit of creep rate, and of all elements.
 PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
 EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
-#: Creep rate that a prior takes where a law has found less.
+#: Least creep rate, per decade of time, that a prior assumes.
 RATE_MIN = 1e-3
 
-#: Patterns that are kept of the prior.
+#: Number of patterns of the prior that are kept.
 PATTERNS = 60
-#: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
-#: errors change by less than a tenth when any of these four is doubled or halved.
+#: Prior of the weights: overall standard deviation, and the power with which the variance falls with the order.
+#: Held-out errors change by less than a tenth when any of these two and the next two is doubled or halved.
 AMPLITUDE, ORDER_POWER = 0.2, 3.0
-#: Correlation length and decay of the weights over the half-width.
+#: Correlation length of the weights over the half-width, and decay length of their variance.
 CORRELATION, DECAY = 0.5, 0.35
-#: Variance of the loading curve beside that of all play operators together.
+#: Variance of the loading curve, relative to that of all play operators together.
 LOADING = 0.3
-#: Fewest coefficients of a Duhem operator of its own, how often they are found to first order, and its weight below
-#: which nothing can be said of them.
+#: An actuator's own Duhem operator: fewest coefficients, number of first-order updates of them, and the weight of the
+#: operator below which they are not determined.
 DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
-#: The step for derivatives by them, and their largest change.
+#: Step of a coefficient for numerical derivatives, and its largest change in one update.
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
-#: Rows that creep is found for at a time.
+#: Number of rows for which creep is computed at a time.
 BLOCK = 32
 
 
 def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
-    """(M, R, N) play operators of half-widths `radius` (R,) along `signals` (M, N) from a degauss at `rest` on."""
+    """(M, R, N) play operators of half-widths `radius` (R,) along `signals` (M, N) after a degauss at `rest`."""
     half_width = radius[:, None]
     play = np.full((len(radius), signals.shape[1]), rest)
     values = np.empty((len(signals), *play.shape))
@@ -42,7 +42,7 @@ def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
 
 
 def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.0) -> Floats:
-    """Powers of the values of play operators along a sequence that begins demagnetised, beyond those at rest.
+    """Powers of the values of play operators along a sequence that begins demagnetised, less their values at rest.
 
     Args:
         signals: (M, N).
@@ -59,10 +59,10 @@ def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.
 
 
 def pattern_basis(radius: Floats, orders: int) -> Floats:
-    """(R D, K) the strongest patterns of the prior over half-widths and orders, each of unit variance."""
+    """(R D, K) strongest patterns of the prior over half-widths and orders, scaled to weights of unit variance."""
     away = np.abs(np.subtract.outer(radius, radius))
     smooth = np.exp(-away / CORRELATION - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
-    smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is apart from the loops
+    smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is independent of the loops
     smooth[0, 0] = LOADING
     order = np.arange(1, orders + 1, dtype=np.float64) ** -ORDER_POWER
     size, axes = np.linalg.eigh(AMPLITUDE**2 * np.kron(smooth, np.diag(order)))
@@ -71,7 +71,7 @@ def pattern_basis(radius: Floats, orders: int) -> Floats:
 
 
 def fading_features(signals: Floats, operators: FadingHysteresis, rest: float = 0.0) -> Floats:
-    """(M, Z, N) values of Duhem operators along `signals` (M, N), which begin at `rest` demagnetised."""
+    """(M, Z, N) values of Duhem operators along `signals` (M, N), which begin demagnetised at `rest`."""
     last = np.full(signals.shape[1], rest)
     states = np.zeros((len(last), operators.size))
     values = np.empty((len(signals), operators.size, len(last)))
@@ -82,7 +82,7 @@ def fading_features(signals: Floats, operators: FadingHysteresis, rest: float = 
 
 
 def padded_slope(slope: Floats, actuators: int) -> Floats:
-    """(N, 2, A) coefficients of a Duhem operator that begins as `slope` (A,), A being at least DUHEM_ORDERS."""
+    """(N, 2, A) coefficients of each actuator's Duhem operator: `slope`, padded with 0 to at least DUHEM_ORDERS."""
     padded = np.pad(slope, (0, max(DUHEM_ORDERS - len(slope), 0)))
     return np.tile(padded, (actuators, 2, 1))
 
@@ -90,7 +90,7 @@ def padded_slope(slope: Floats, actuators: int) -> Floats:
 def fading_changes(signals: Floats, slope: Floats, rest: float = 0.0) -> Floats:
     """(M, 2 A, N) derivatives of :func:`fading_features` by the coefficients `slope` (N, 2, A) of its operator.
 
-    0 for those whose change leads to no operator.
+    A derivative is 0 where the changed coefficients give no valid operator.
     """
     still = fading_features(signals, FadingHysteresis(slope), rest)
     changes = []
@@ -105,11 +105,11 @@ def fading_changes(signals: Floats, slope: Floats, rest: float = 0.0) -> Floats:
 
 
 def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
-    """(N, 2, A) coefficients of each actuator's operator, to first order.
+    """(N, 2, A) coefficients of each actuator's Duhem operator after one first-order update.
 
     Args:
         slope: (N, 2, A) to begin with.
-        weight, changes: (N,) and (2 A, N) weights of the operator and of :func:`fading_changes`.
+        weight, changes: (N,) and (2 A, N) fitted weights of the operator and of :func:`fading_changes`.
     """
     known = np.abs(weight) > DUHEM_WEIGHT_MIN
     change = np.where(known, changes / np.where(known, weight, 1.0), 0.0).T.reshape(slope.shape)
@@ -117,14 +117,14 @@ def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
     for share in (1.0, 0.5, 0.25):
         try:
             DuhemOperator(slope + share * change)
-        except ValueError:  # it leads nowhere
+        except ValueError:  # no valid operator
             continue
         return slope + share * change
     return slope
 
 
 def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
-    """(M, J, ...) what the creep elements have followed of `values` (M, ...) at each `time`; see :func:`crept`."""
+    """(M, J, ...) states of the creep elements, which follow `values` (M, ...), at each `time`; see :func:`crept`."""
     shape = (len(CREEP_TIMES), *(1,) * (values.ndim - 1))
     moved = _moved(time, start, moved)
     still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
@@ -139,14 +139,14 @@ def creep_states(values: Floats, time: Floats, start: float, moved: Floats | Non
 
 
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None, weight: Floats = EVEN) -> Floats:
-    """What creep adds to features (M, ...) at each `time` (M,) s; all before `start` was 0.
+    """Creep of features (M, ...) at each `time` (M,) s; all features were 0 before `start`.
 
-    An element has followed all but its lag, the sum over moves of their sizes times exp(-age / time constant).
+    The state of an element is the feature less its lag, the sum over moves of size times exp(-age / time constant).
 
     Args:
-        moved: (M,) s, when each row began to stand, between the measurements; None = right after the one before.
-        weight: (J,) of the creep elements, or (J, N) of each actuator, the last axis of the features; of an even
-            spectrum, per unit of creep rate, where not given.
+        moved: (M,) s, when each shape was taken, between the measurements; None = right after the one before.
+        weight: (J,) of the creep elements, or (J, N) for each actuator, the last axis of the features; by default those
+            of an even spectrum, per unit of creep rate.
     """
     share = weight.reshape(len(CREEP_TIMES), -1).T
     values = features.reshape(len(features), -1, len(share))
@@ -165,12 +165,12 @@ def crept(features: Floats, time: Floats, start: float, moved: Floats | None = N
 
 
 def _moved(time: Floats, start: float, moved: Floats | None) -> Floats:
-    """(M,) s, when each row began to stand; see :func:`crept`."""
+    """(M,) s, when the mirror took the shape of each row; see :func:`crept`."""
     return np.concatenate(([start], time[:-1])) if moved is None else np.clip(moved, start, time)
 
 
 def weight_of(rate: float) -> float:
-    """Weight of each creep element that a prior expects of a law of the creep rate `rate`."""
+    """Weight of each creep element that a prior expects of a law with the creep rate `rate`."""
     return max(rate, RATE_MIN) * PER_ELEMENT
 
 
@@ -179,8 +179,8 @@ def spectrum_prior(rate: float, spread: float, correlation: float) -> Floats:
 
     Args:
         rate: creep rate of the law.
-        spread: standard deviation relative to the weight that goes with it.
-        correlation: elements over which the spectrum stays alike to 1/e.
+        spread: standard deviation relative to the weight expected for `rate`.
+        correlation: number of elements over which the correlation falls to 1/e.
     """
     number = np.arange(len(CREEP_TIMES))
     apart = np.abs(np.subtract.outer(number, number))
@@ -188,7 +188,7 @@ def spectrum_prior(rate: float, spread: float, correlation: float) -> Floats:
 
 
 def relaxation(time: Floats, start: float) -> Floats:
-    """(M,) how much of an old displacement's creep is still to fade at `time` (s) when it ended at `start`."""
+    """(M,) creep left at `time` (s) of an old displacement that ended at `start`, for an even spectrum of unit rate."""
     return np.asarray(np.exp(-(time[:, None] - start) / CREEP_TIMES).sum(axis=1) * PER_ELEMENT)
 
 

@@ -1,4 +1,4 @@
-"""From the maps of a run to the law of a mirror, with what it may be trusted to predict."""
+"""Identify the law of a mirror from the maps of a run, with the error to be expected of its predictions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,10 +18,10 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
-#: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
-#: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
+#: Outliers: a map whose residual exceeds OUTLIER medians contradicts the law (the mirror was touched, or the map is of
+#: another). It is fitted again without them, OUTLIER_ROUNDS fits at most, unless they exceed the share OUTLIERS_MAX.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
-#: Draws for quantiles of the largest of many correlated errors.
+#: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
 
 
@@ -30,11 +30,11 @@ class HysteresisFit:
     """Hysteresis and creep of one mirror.
 
     Attributes:
-        zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, on maps that had no part in
-            the fit, the maps' own noise taken off; 0 for piston and tilt.
-        held_out_max_zernike: m, 95th percentile of the largest of them.
+        zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, from maps that had no part in
+            the fit, with the noise of the maps subtracted; 0 for piston and tilt.
+        held_out_max_zernike: m, 95th percentile of the largest of these errors.
         unknown_sigma: standard deviation of an effective signal when the history is not known.
-        maps: number that the law was identified from.
+        maps: number of maps from which the law was identified.
         remarks: sentences on how the law was chosen.
     """
 
@@ -55,7 +55,7 @@ def fit_hysteresis(
     Maps of kind CHECK test the law before they join the final fit.
 
     Args:
-        limits: of the signals; the law has an inverse between them. None = between the signals of the run.
+        limits: of the signals between which the law must have an inverse; None = the range of the run.
 
     Raises:
         ExcitationError: the maps do not show hysteresis.
@@ -84,7 +84,7 @@ def fit_hysteresis(
 
 
 def _without_outliers(run: Run, test: Rows, candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
-    """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
+    """Identify the law without outliers; in the run returned only the other maps are usable, all commands stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
         agreeing = _agreeing(run.responses.usable, found.fit.residual)
@@ -95,7 +95,7 @@ def _without_outliers(run: Run, test: Rows, candidates: Sequence[Candidate]) -> 
 
 
 def _agreeing(used: Rows, residual: Floats) -> Rows:
-    """(M,) the rows of those `used` whose `residual` (M, D) is none of an outlier; all where these are too many."""
+    """(M,) rows in `used` whose `residual` (M, D) is not an outlier; all rows in `used` if outliers are too many."""
     size = np.linalg.norm(residual, axis=1)
     outlier = used & (size > OUTLIER * np.median(size[used]))
     return used if outlier.sum() > OUTLIERS_MAX * used.sum() else used & ~outlier
@@ -112,7 +112,7 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
 
 
 def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
-    """`maps` of one run with effective signals in the place of those applied.
+    """`maps` of one run with effective signals in place of the applied ones.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -121,15 +121,15 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
 
 
 def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, HysteresisModel]:
-    """Maps with effective signals, and the law with what the actuators had crept to before the last part of their run.
+    """Maps with effective signals, and the law with the creep that the actuators had before the last part of their run.
 
     Args:
-        run: of the maps; those that contradict a law may not be usable in it.
+        run: of these maps; those that contradict a law may be marked as not usable.
     """
     effective = run.follow(law)
     if not law.creep_rate:
         return replace(maps, applied=effective), law
-    # How much of an old displacement of each actuator still shows, by the time since it ended.
+    # Share of an old displacement of each actuator that is still left, by the time since it ended.
     fading = np.zeros((len(maps), len(run.parts), maps.actuators))
     for number, (rows, start) in enumerate(run.parts):
         elapsed = run.time[rows, None] - start
@@ -142,15 +142,15 @@ def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, Hys
 
 
 def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
-    """(S, N) effective signals that the mirror had crept to before each degauss, from what fades in the figure.
+    """(S, N) effective signals to which the mirror had crept before each degauss, from what fades in the figure.
 
-    Without this the fading goes into the figure, which then belongs to the time of the run only. Expected to be of
-    order 1, like all effective signals; that keeps patterns quiet which the maps hardly show. Maps that contradict the
-    effective signals have no say.
+    Without this the fading goes into the figure, which is then valid at the time of the run only. The prior standard
+    deviation is 1, the size of all effective signals; that suppresses patterns which the maps hardly show. Maps that
+    contradict the effective signals are left out.
 
     Args:
         effective: (M, N).
-        fading: (M, S, N) how much of it each map still shows.
+        fading: (M, S, N) share of it that is left in each map.
     """
     agreeing, count, values = responses.usable, responses.coefficients, responses.values
     whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
@@ -182,7 +182,7 @@ def unknown_history_sigma(law: HysteresisModel, low: float, high: float) -> floa
 
 
 def _error_covariance(found: Identification, count: int, maps: MapSet) -> Floats:
-    """(K - 3, K - 3) m^2 of the `count` coefficients of moves predicted, without the noise of their maps."""
+    """(K - 3, K - 3) m^2, error covariance of the `count` coefficients of predicted moves, without noise of maps."""
     rows = found.held_out[:, :count] / TERM_RMS[PISTON_TILT : maps.terms]
     rows = rows[np.isfinite(rows).all(axis=1)]
     size, axes = np.linalg.eigh(rows.T @ rows / len(rows) - np.diag(maps.noise_variance()))

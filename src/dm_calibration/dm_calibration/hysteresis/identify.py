@@ -1,9 +1,9 @@
 """Identification of the hysteresis model from the maps of a calibration run.
 
-Which features a mirror needs is not known beforehand: candidates from none to all are fitted to parts of the run
-(:mod:`~dm_calibration.hysteresis.candidate_fit`), and the one that predicts the other parts best is taken. Laws of
-each actuator by itself (:mod:`~dm_calibration.hysteresis.own_laws`) are one more candidate, so a mirror whose actuators
-are alike keeps its common law.
+Which features a mirror needs is not known beforehand: candidates from none to all of them are fitted to parts of the
+run (:mod:`~dm_calibration.hysteresis.candidate_fit`), and the one that best predicts the other parts is taken. Laws
+with own weights for each actuator (:mod:`~dm_calibration.hysteresis.own_laws`) are one more candidate, so a mirror
+whose actuators are alike keeps its common law.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,14 +23,14 @@ from dm_common.hysteresis.model import CREEP_RATE_MAX
 
 #: The smallest slope of a law that an open loop can invert safely.
 SLOPE_MIN = 0.1
-#: A simpler candidate is taken when its held-out error is at most this much larger.
+#: A simpler candidate is preferred unless its held-out error is larger by more than this factor.
 PARSIMONY = 1.03
-#: Where a run has fewer other maps than so many per actuator, or tests in its first half, so that it may end early,
-#: each half of the test maps is predicted with the other half in the fit. Without any, moves in use lie far outside
-#: what so few maps show: 5 to 10 nm in the median of mirrors after 100 maps, where the final fit errs by 3.
+#: With fewer training maps per actuator than this, or with test maps in the first half of the run (it may end early),
+#: each half of the test maps is predicted by a fit that includes the other half. A fit without any test maps would have
+#: to extrapolate: the median error over mirrors is then 5 to 10 nm after 100 maps; that of the final fit is 3 nm.
 FEW = 4
-#: How often an actuator must turn, and over what swing, to show a law, and the share of them, one at least, that may do
-#: less: the others determine the common law, and what is not known of those few follows it.
+#: Fewest turns and least swing with which an actuator shows its law, and the share of the actuators, at least one, that
+#: may do less: the others determine the common law, which these few then follow.
 TURNS_MIN, SWING_MIN, QUIET_SHARE = 10, 0.3, 0.1
 
 
@@ -46,9 +46,9 @@ class Identification:
         fit: of the chosen candidate, to all maps.
         held_out: (M, D) residual of maps that had no part in the fit: the test maps, or where there are none, each part
             of the run in turn; NaN = not predicted.
-        scores: held-out error of each candidate relative to the best; that of the best before it, of a richer one that
-            leaves hardly less in the maps it was fitted to.
-        refused: candidates that cannot be inverted, or creep without bound, with the reason; the final fit too.
+        scores: held-out error of each candidate relative to the best. A richer candidate that hardly fits its own maps
+            better than the best before it has the score of that one.
+        refused: reason for each candidate, and for the final fit, that cannot be inverted or creeps without bound.
         quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
@@ -60,7 +60,7 @@ class Identification:
 
     @property
     def quiet_remark(self) -> str:
-        """That the quiet actuators follow the law of the others, as a sentence; "" = there are none."""
+        """Sentence that the quiet actuators follow the law of the others; "" = there are none."""
         if not self.quiet:
             return ""
         names = ", ".join(str(number + 1) for number in self.quiet)
@@ -71,7 +71,7 @@ class Identification:
 
     @property
     def changed_remark(self) -> str:
-        """Whose law was changed so that it can be inverted, as a sentence; "" = nobody's."""
+        """Sentence that names the actuators whose law was changed so that it can be inverted; "" = none."""
         if not isinstance(self.fit, OwnFit) or not self.fit.changed.any():
             return ""
         names = ", ".join(str(number + 1) for number in np.flatnonzero(self.fit.changed))
@@ -93,12 +93,12 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
-            hysteresis as it has, and begins with the best common one of its kind; where it fades, with another if that
-            leaves much less; where it cannot be inverted then, with the next.
+        candidates: tried in this order; the first has no hysteresis to invert. An own one is tried if it agrees with
+            the best so far in having hysteresis or not. It begins with the best common law of its kind; if it fades,
+            with another that leaves a much smaller residual; if the result cannot be inverted, with the next.
         folds: parts of the run that are predicted from the others.
-        blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
-        slope_min: smallest slope of a law over the signals that it is for.
+        blocks: contiguous blocks of rows in each part, spread over the run; several avoid extrapolation of slow drift.
+        slope_min: smallest slope allowed of a law over the signals for which it is meant.
 
     Raises:
         ExcitationError: the run does not show hysteresis.
@@ -112,7 +112,7 @@ def identify(
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
-    common: list[tuple[float, LawFit]] = []  # own laws that fade may begin with one that cannot be inverted, too
+    common: list[tuple[float, LawFit]] = []  # also non-invertible ones that fade: own laws may begin with them
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
 
@@ -133,7 +133,7 @@ def identify(
             return
         gain = size(best[2].residual) / size(whole.residual) if best else np.inf
         if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
-            scores[name] = best[0]  # what it leaves of its own maps is hardly less: nor is what it predicts
+            scores[name] = best[0]  # it hardly fits its own maps better, so it will not predict better
         else:
             held_out = np.full_like(whole.residual, np.nan)
             for fold in range(folds):
@@ -177,10 +177,10 @@ def identify(
 def _begun(
     run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Rows, slope_min: float
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
-    """Own laws that begin with each of the common ones `starts`, fitted to the rows `keep`, in the order to be tried.
+    """Own laws that begin with each of the common laws `starts`, fitted to the rows `keep`, in the order to be tried.
 
-    How hysteresis fades stays nearly as it begins, and a law without plays may begin far from what it is, or one that
-    cannot be inverted near it: another than the first of `starts` comes first where it leaves much less.
+    Duhem operators stay close to where they begin: with a common law without plays that may be far from the truth, with
+    one that cannot be inverted near it. So a start with a much smaller residual than the first precedes it.
     """
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
@@ -202,12 +202,12 @@ def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
 
 
 def _size(run: Run, residual: Floats) -> float:
-    """Root mean square of the coefficients of `residual` (M, D): beside them the noise of maps hides errors of laws."""
+    """Rms of the coefficients in `residual` (M, D); in the other values the noise of maps would hide errors of laws."""
     return float(np.sqrt(np.mean(np.square(residual[:, : run.responses.coefficients]))))
 
 
 def _contains(richer: Candidate, simpler: Candidate) -> bool:
-    """Whether the laws of `richer` are those of `simpler` and more."""
+    """Whether the laws of `richer` include all those of `simpler`."""
     return all(more >= less for more, less in zip(astuple(richer)[1:], astuple(simpler)[1:], strict=True))
 
 
@@ -239,7 +239,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
 
 
 def _scatter(run: Run, keep: Rows) -> Floats:
-    """(D,) uncertainty of each response, from what a rich law leaves: one value for coefficients, one per pattern."""
+    """(D,) uncertainty of each response, from residuals of a rich law: one value for coefficients, one per pattern."""
     responses = run.responses
     scatter = np.where(np.arange(responses.values.shape[1]) < responses.coefficients, 1e-9, 1e-8)
     for _ in range(2):

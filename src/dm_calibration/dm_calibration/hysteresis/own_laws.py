@@ -1,16 +1,16 @@
-"""Laws of hysteresis and creep of each actuator by itself, drawn towards common ones as far as the maps say.
+"""Hysteresis and creep laws of each actuator by itself, drawn towards common ones as far as the maps support it.
 
 Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
-any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r; a Gaussian prior
-makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that sixty
-numbers an actuator describe a law. The patterns of all actuators are drawn towards each other: those that one
-actuator shows badly are the mean of the others. Creep is a spectrum over the elements of the model, smooth over the
-logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum of their own,
-since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all actuators alike, so
-what is left out here does not average out in them: without, it passes for slow creep.
+any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r. A Gaussian prior
+makes them similar for neighbouring r and small for high orders; only its strongest patterns are kept, so that sixty
+numbers per actuator describe a law. The patterns of all actuators are drawn towards each other: weights that the maps
+hardly determine for one actuator become the mean of the others. Creep is a spectrum over the elements of the model,
+smooth over the logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum
+of their own, since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all
+actuators alike, so what is left out here does not average out in them: it would pass for slow creep.
 
-Responses are linear in the gains of the actuators, in their patterns and in their spectra: each is a regularised
-least-squares solution given the other two, in turn. That of the patterns is one system of all actuators, since the
+Responses are linear in the gains of the actuators, in their patterns and in their spectra. Each of the three is solved
+for in turn by regularised least squares, given the other two. The patterns of all actuators are one system, since the
 responses of neighbours overlap; its matrix is the elementwise product of the Gram matrices of features and gains.
 """
 
@@ -40,33 +40,33 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised, slope_min
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
-#: Prior standard deviations of a Duhem operator's weight, and of that times the change of a coefficient of its slope.
+#: Prior standard deviations: weight of a Duhem operator; that weight times the change of a slope coefficient.
 DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
-#: Rates of linear Duhem operators, per signal travelled, the powers of the signal that they follow, from 0 on, and the
+#: Linear Duhem operators: rates, per signal travelled; number of powers of the signal that they follow, from 0 on;
 #: prior standard deviation of their weights.
 FADING_RATE, FADING_POWERS, FADING_WEIGHT = np.array([1.0, 3.0, 9.0]), 3, 0.1
-#: Prior of the creep spectrum: standard deviation relative to the common rate, and between actuators relative to that.
+#: Prior of the creep spectrum: standard deviation relative to the common rate; spread of actuators relative to that.
 SPECTRUM, SPECTRUM_SPREAD = 0.5, 0.3
-#: Its correlation over elements.
+#: Correlation length of that prior, in elements.
 SPECTRUM_CORRELATION = 12.0
-#: Loops are followed otherwise than the rest by elements of up to so many seconds: prior standard deviation of that.
+#: Loops may have another spectrum over elements of up to LAG_S (s); LAG: prior standard deviation of the difference.
 LAG_S, LAG = 30.0, 0.02
 LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
-#: Weights of creep: of its elements, and of what those that follow loops add; the last is the change of creep.
+#: Rows of the weights of creep: its elements, and what they add for loops; the last row is the change of creep.
 ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
-#: Rounds of the three solutions in turn, of runs of so many maps: with 6 slow creep is a third less true and held-out
-#: errors up to four times as large, with 60 hardly better. Of shorter runs as many more: of 100 maps 60 leave up to a
-#: quarter less than 20, on some mirrors a tenth more.
+#: Rounds of the three alternating solutions, for a run of ROUNDS_MAPS maps: with 6, slow creep is a third less accurate
+#: and held-out errors are up to four times as large; 60 are hardly better. Shorter runs get proportionally more: for
+#: 100 maps errors after 60 rounds are up to a quarter smaller than after 20, on some mirrors a tenth larger.
 ROUNDS, ROUNDS_MAPS = 20, 300
-#: Maps for each actuator that tell how far actuators differ: of fewer, fitted so closely, too much is found.
+#: Fewest maps per actuator to estimate the spread between actuators; the close fit to fewer maps overestimates it.
 ASKED_MAPS = 5
-#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in up to so many steps. Where
-#: more than a tenth would have to go and its Duhem operator is its own, it takes the common one first. One of many may
-#: fall where hardly a map shows it: a law that would keep less than LEAST is drawn halfway to the mean of the others
-#: instead, and its Duhem operator to none. Where more than one, and more than a share LOST, are so, they stay, to be
-#: refused.
+#: Laws whose slope is too small to be inverted safely lose a share of their hysteresis, in up to SHRINKS steps. A law
+#: with its own Duhem operator that would keep less than SHRUNK of it takes the common operator first. A single law may
+#: be too flat where hardly any map shows it: one that would keep less than LEAST is drawn halfway to the mean of the
+#: others instead, with its Duhem weight halved. If this concerns more than one law and more than the share LOST of
+#: them, they are left unchanged, and the fit will be refused.
 SHRINKS, SHRUNK, LEAST, LOST = 8, 0.9, 0.7, 0.1
 
 
@@ -78,7 +78,7 @@ class OwnFit(LawFit):
         patterns: (F, N) weights of the features of each actuator.
         creep: (J + L + 1, N) weights of the creep elements, what the first L of them add for loops, and the change of
             creep per unit of position.
-        scatter: (D,) uncertainty of each response, from what these laws leave.
+        scatter: (D,) uncertainty of each response, from the residual of these laws.
         changed: (N,) whether a law was changed so that it can be inverted, see SHRUNK.
     """
 
@@ -89,17 +89,17 @@ class OwnFit(LawFit):
 
 
 class OwnLaws:
-    """Laws of each actuator on one run: features once, then fits to any of its rows.
+    """Laws of each actuator on one run: features are computed once, then fitted to any rows.
 
     Args:
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
-        slope_min: of each law, see SHRUNK.
+        slope_min: smallest slope allowed of each law, see SHRUNK.
 
     Attributes:
-        spread: of the patterns between actuators, told by the maps of the first fit, with which later ones of other
-            maps begin; None = before half of its rounds, or not told by so few maps.
+        spread: of the patterns between actuators, estimated in the first fit and reused by later ones to other rows;
+            None = not yet estimated (before half of its rounds), or too few maps to do so.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class OwnLaws:
             linear = FadingHysteresis(rates=FADING_RATE, drive=np.zeros((len(FADING_RATE), FADING_POWERS)))
             columns.append(run.fading(linear))
         self._plain = np.concatenate(columns, axis=1)
-        #: Which features are patterns of the play operators, and which linear Duhem operators.
+        #: Feature ranges: the patterns of the play operators, and the linear Duhem operators.
         first = 1 + self._basis.shape[1]
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         count = signals.shape[1]
@@ -141,7 +141,7 @@ class OwnLaws:
         self._creep_between = alike(count, SPECTRUM_SPREAD)
 
     def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
-        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
+        """Fit to the rows in `keep` (M,), from `start`, whose Duhem operators are kept, or from no hysteresis."""
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
             patterns, creep = start.patterns, start.creep
@@ -152,7 +152,7 @@ class OwnLaws:
             creep = np.zeros((len(self._creep_root), actuators))
             creep[ELEMENTS] = self._creep if self._creeps else 0.0
             scatter, slope, changed = self._scatter, self._slope, np.zeros(actuators, dtype=bool)
-            if slope.size and actuators > 1:  # messages tell one weight with one slope for both ways
+            if slope.size and actuators > 1:  # a message with one weight holds one slope for both ways
                 slope = padded_slope(slope, actuators)
                 own = self._linear.stop
                 for _ in range(DUHEM_ROUNDS):
@@ -187,7 +187,7 @@ class OwnLaws:
         return OwnFit(self.candidate, law, residual, patterns, creep, scatter, changed)
 
     def _share_kept(self, law: HysteresisModel) -> Floats:
-        """(N,) share of its hysteresis that each law may keep to be inverted safely: 1 and more = all of it."""
+        """(N,) share of its hysteresis that each law may keep to be inverted safely; 1 or more = all of it."""
         return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.in_use), 0.999)))
 
     def _features(self, slope: Floats) -> Floats:
@@ -203,7 +203,7 @@ class OwnLaws:
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after some solutions in turn."""
+        """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after all rounds."""
         sigma = np.full(features.shape[1], DUHEM_CHANGE)
         sigma[: self._linear.stop + 1] = DUHEM_WEIGHT
         sigma[self._linear], sigma[self._patterned], sigma[0] = FADING_WEIGHT, 1.0, 1.0
@@ -225,7 +225,7 @@ class OwnLaws:
         return patterns * sigma[:, None], creep, scatter, residual
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
-        """The law of the weights (F, N) and (J + L + 1, N)."""
+        """The law with the weights `patterns` (F, N) and `creep` (J + L + 1, N)."""
         orders = self.candidate.powers
         series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(self.radius), orders)
         powers = [
@@ -242,7 +242,7 @@ class OwnLaws:
             play_weight,
             slope,
             patterns[-1].copy() if slope.size else 0.0,
-            min(mean / PER_ELEMENT, CREEP_RATE_MAX),  # a law that creeps so much is not taken
+            min(mean / PER_ELEMENT, CREEP_RATE_MAX),  # a law at this bound will be refused
             CREEP_TIMES,
             share / mean if mean else np.zeros(0),
             lag_spectrum=-lag / mean if mean else np.zeros(0),
@@ -264,7 +264,7 @@ class OwnLaws:
         return features * (1.0 + slope[:, None]) + added
 
     def _scatter_of(self, residual: Floats) -> Floats:
-        """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
+        """(D,) m, robust scatter of the responses, one value for all coefficients; outlying maps hardly affect it."""
         count = len(residual)
         freedom = max(count - self.run.figure.shape[1] - self._plain.shape[2], 1)
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
@@ -273,7 +273,7 @@ class OwnLaws:
     def _patterns(
         self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, ask: bool
     ) -> Floats:
-        """(F, N): the signal itself counts 1, the others follow their prior. `ask` for how far actuators differ."""
+        """Weights (F, N): 1 for the signal itself, the others by their prior; `ask`: estimate the spread first."""
         left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
         if ask:
             self.spread = likeliest_spread(features, left, gains, begin[1:])
@@ -283,7 +283,7 @@ class OwnLaws:
     def _spectra(
         self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats
     ) -> Floats:
-        """(J + L + 1, N) weights of the creep elements, of those that only loops follow, and creep's change."""
+        """(J + L + 1, N) weights of the creep elements, what they add for loops, and the change of creep."""
         elements = self.run.creep_states(position)
         lags = elements[:, :LAGS] - self._signal_states[:, :LAGS]
         elements = np.concatenate((elements, lags), axis=1)

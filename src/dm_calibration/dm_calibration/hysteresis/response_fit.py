@@ -1,7 +1,7 @@
 """The law of a mirror from any linear measurement of it: sag, Zernike coefficients, slopes of a wavefront sensor.
 
-Records of other laboratories, of mirrors by any principle, need neither ROS nor map files: commands, what was measured
-and times are enough to see which law predicts best, and by how much.
+Records of other laboratories, of mirrors of any principle, need neither ROS nor map files: commands, measurements and
+times are enough to find which law predicts best, and by how much.
 """
 
 from collections.abc import Sequence
@@ -18,24 +18,24 @@ from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 
-#: Laws that are compared: those of a calibration, and squares of the signal between straight and cubic.
+#: Laws that are compared: those of a calibration, and a quadratic one between the linear and the cubic.
 LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
-#: Size that all measurements are brought to, m, that of a deformation: thresholds of the fit are made for it.
+#: Size to which all measurements are scaled, m: that of a deformation, for which the thresholds of the fit are made.
 _SIZE = 1e-6
-#: Blocks of rows that make each part left out.
+#: Contiguous blocks of rows in each part that is left out.
 _BLOCKS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """What a record says of its mirror. D are the numbers of one measurement, in their own unit.
+    """What a record shows of its mirror. D is the number of values of one measurement; they keep their own unit.
 
     Attributes:
         name: class of the law that predicts best; of nearly equal ones the simplest.
         law: of the actuators, from the whole record.
-        influence: (N, D) what a unit of each effective signal does.
-        figure: (D,) what was measured at effective signals 0, in the mean over the record.
-        drift: (D,) change of that from the first measurement to the last.
+        influence: (N, D) change for a unit of each effective signal.
+        figure: (D,) measurement at effective signals 0, averaged over the record.
+        drift: (D,) change of the figure from the first measurement to the last.
         held_out: error of each law on parts of the record that it was not fitted to, relative to the signal: rms over
             all numbers, divided by their standard deviation over the record.
         measurements: number of rows used.
@@ -52,7 +52,7 @@ class ResponseFit:
     remark: str = ""
 
     def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
-        """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to.
+        """(M, D) measurements predicted for `commands` (M, N) at `times` (M,) s, from a degauss or from rest.
 
         Raises ValueError as :func:`identify_response` does for commands and times.
         """
@@ -83,13 +83,13 @@ def identify_response(
     Parameters
     ----------
     commands : array_like (M, N)
-        Signals that stood at the mirror, normalised to -1..+1, in order: some hundred random ones, from a degauss or,
-        where there is no hysteresis, from anywhere.
+        Signals applied to the mirror, normalised to -1..+1, in order: some hundred random ones, from a degauss or, if
+        there is no hysteresis, from any state.
     measured : array_like (M, D)
-        What was measured, of equal uncertainty and linear in the surface: sag or slopes at points, coefficients. Take
-        off first what is not the mirror's, such as a tilt that differs from map to map. Rows with NaN do not count.
+        Measurements of equal uncertainty that are linear in the surface: sag or slopes at points, coefficients. First
+        subtract what is not due to the mirror, such as a tilt that changes from map to map. Rows with NaN are ignored.
     times : array_like (M,), optional
-        When, s. Creep and drift need them; one second apart where not given.
+        Times of the measurements, s; needed for creep and drift. By default one second apart.
     candidates
         Laws to compare, as for :func:`~dm_calibration.hysteresis.identify.identify`.
 
@@ -115,7 +115,7 @@ def identify_response(
         raise ValueError("measured: nothing in it changes")
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
     if brought.shape[1] > len(brought):
-        # Fewer numbers a row, of the same sums of squares.
+        # Fewer values per row with the same sums of squares.
         brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
     run = Run(signals, seconds, Responses(brought, brought.shape[1], usable))
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
@@ -146,7 +146,7 @@ def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
 
 
 def check_signals(signals: Floats) -> None:
-    """Raise ValueError where `signals` (M, N) are not finite and normalised, as volts are not."""
+    """Raise ValueError where `signals` (M, N) are not finite or not normalised (volts, for instance)."""
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
     if not finite.all():
         raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")

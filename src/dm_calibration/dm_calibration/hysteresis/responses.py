@@ -1,4 +1,4 @@
-"""What maps say of the actuators, as numbers of like uncertainty: coefficients, and sag beyond them in few modes.
+"""Maps reduced to values of similar uncertainty: Zernike coefficients, and sag beyond them in a few modes.
 
 Coefficients come from all pixels of a map and are good to a fraction of a nanometre; sag at the sampling points is
 coarser, since a point with missing neighbours is the mean of the others. Beyond the coefficients a mirror of N
@@ -17,17 +17,17 @@ from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
-#: Least uncertainty of a response, m, that of data without noise.
+#: Least uncertainty of a response, m, for data without noise.
 SCATTER_MIN = 1e-11
 #: Patterns weaker than this share of the strongest are noise.
 WEAKEST_PATTERN = 0.03
-#: Points without data are filled by the others where these are so many of them; amplitudes are drawn to 0 by this share
-#: of what a whole map says of them.
+#: Least share of points with data for which modes fitted to them fill the gaps; ridge on the amplitudes of these modes,
+#: relative to the information of a map without gaps.
 FILLED_MIN, FILL_RIDGE = 0.9, 1e-3
 
 
 class Reduction:
-    """Between K coefficients with sag at P points, and R = K - 3 + B values in m rms.
+    """Converts between K coefficients with sag at P points and R = K - 3 + B values in m rms.
 
     The first K - 3 values are coefficients beyond tilt, each as the rms sag of its term; the others are amplitudes of
     the B patterns that a mirror's N actuators show beyond the terms, strongest first.
@@ -62,9 +62,9 @@ class Reduction:
         return np.concatenate((low, self._beyond(sag) @ self._patterns.T), axis=-1)
 
     def fill(self, sag: Floats) -> Floats:
-        """`sag` (P,) m less piston and tilt, where it is NaN as terms and patterns that fit the other points say.
+        """`sag` (P,) m less piston and tilt; NaN is replaced by the terms and patterns fitted to the other points.
 
-        A wide gap hides too much of some of them: it is filled with a plane.
+        A wide gap leaves too many of these undetermined, so it is filled with a plane.
         """
         known = np.isfinite(sag)
         if known.mean() < FILLED_MIN:
@@ -87,12 +87,12 @@ class Reduction:
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Measured numbers of M maps.
+    """Measured values of M maps.
 
     Attributes:
         values: (M, K - 3 + B) m rms: coefficients beyond tilt, as rms sag each, and patterns beyond them.
         coefficients: K - 3.
-        usable: (M,) maps that say something; rows of others are 0.
+        usable: (M,) maps that hold data; rows of the others are 0.
     """
 
     values: Floats
@@ -100,7 +100,7 @@ class Responses:
     usable: NDArray[np.bool_]
 
     def scatter(self, size: Floats) -> Floats:
-        """(D,) m, uncertainty of each response where a fit leaves `size` (D,) of it: one value for all coefficients."""
+        """(D,) m, uncertainty of each response from residuals of `size` (D,): one value for all coefficients."""
         scatter = np.maximum(size, SCATTER_MIN)
         scatter[: self.coefficients] = np.median(scatter[: self.coefficients])
         return np.asarray(scatter)
@@ -121,7 +121,7 @@ def responses_of(maps: MapSet) -> Responses:
     modes = basis(maps.points.x, maps.points.y)
     design = np.column_stack((np.ones(len(maps)), maps.applied))[usable]
     model: Floats = maps.coefficients[usable] @ modes.T
-    for _ in range(4):  # the gaps' own share shrinks to nothing in some rounds
+    for _ in range(4):  # the influence of the gaps vanishes within some rounds
         filled = fill_gaps(sag, model, maps.points)
         solution = np.asarray(np.linalg.lstsq(design, filled, rcond=None)[0], dtype=np.float64)
         model = design @ solution

@@ -1,9 +1,8 @@
-"""The commands of a calibration run and what its maps say, in parts that each begin with a degauss.
+"""The commands of a calibration run and its maps, in parts that each begin with a degauss.
 
-A part begins where the run began or was resumed. What the actuators did between two parts is not known. A degauss
-wipes their hysteresis; their creep before it fades in a pattern that is unknown, as it is before the first part, and
-the mirror may have drifted meanwhile. Further degausses within a part wipe hysteresis too, but creep before them is
-known.
+A part begins where the run began or was resumed. What the actuators did before a part is not known. The degauss erases
+its effect on hysteresis, but not on creep, which fades in an unknown pattern; between two parts the mirror may also
+have drifted. Further degausses within a part erase hysteresis too, but there the creep from before is known.
 """
 
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import HysteresisModel
 
-#: A step of the figure is this much more likely than fading creep to explain few maps.
+#: Scale of fading creep of resumed parts: where few maps cannot separate the two, a step of the figure is preferred.
 _FADING_SCALE = 0.1
 
 
@@ -35,9 +34,9 @@ class Run:
         start: s, when the degauss had ended.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
-        degaussed: (M,) before which maps, at mid range, the mirror was degaussed in its course; None = none.
+        degaussed: (M,) maps at mid range before which the mirror was degaussed in the course of the run; None = none.
         rest: signal of mid range, where a degauss ends.
-        limits: lowest and highest signal that a law of the run is for; None = those of the run.
+        limits: lowest and highest signal for which a law of the run is meant; None = those of the run.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -69,7 +68,7 @@ class Run:
         return [(slice(*bound), start) for bound, start in zip(bounds, starts, strict=True)]
 
     def along(self, feature: Callable[[Floats], Floats]) -> Floats:
-        """A `feature` of signals that begin demagnetised, along the commands."""
+        """Values of `feature`, a function of signals that begin demagnetised, along the commands."""
         sequences = [rows for part, _ in self.parts for rows in self._sequences(part)]
         return np.concatenate([feature(self.signals[rows]) for rows in sequences])
 
@@ -84,16 +83,16 @@ class Run:
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Lowest and highest signal of the actuators that moved; one without a channel stands elsewhere."""
+        """Lowest and highest signal of the actuators that moved; those without a channel may stand elsewhere."""
         moved = self.signals[:, np.ptp(self.signals, axis=0) > 0.0]
         return float(moved.min()), float(moved.max())
 
     @property
     def in_use(self) -> tuple[float, float]:
-        """Lowest and highest signal at which a law of the run may be inverted: its reach, and the limits.
+        """Lowest and highest signal at which a law of the run may be inverted: from its reach and the limits.
 
-        Where neighbours may not differ much, short runs come nowhere near an end of the range, and polynomials may
-        fall there.
+        With a tight limit between neighbours, short runs stay far from the ends of the range, where polynomials may
+        fall.
         """
         low, high = self.limits or self.reach
         return min(low, self.reach[0]), max(high, self.reach[1])
@@ -111,13 +110,13 @@ class Run:
         return np.concatenate(followed)
 
     def creep_states(self, values: Floats) -> Floats:
-        """(M, J, ...) what the creep elements have followed of `values` (M, ...) at each map."""
+        """(M, J, ...) states of the creep elements, which follow `values` (M, ...), at each map."""
         return np.concatenate(
             [creep_states(values[rows], self.time[rows], start, self._moved(rows)) for rows, start in self.parts]
         )
 
     def crept(self, features: Floats, weight: Floats = EVEN) -> Floats:
-        """What creep adds to `features` (M, ...); see :func:`~dm_calibration.hysteresis.features.crept`."""
+        """Creep of `features` (M, ...); see :func:`~dm_calibration.hysteresis.features.crept`."""
         return np.concatenate(
             [crept(features[rows], self.time[rows], start, self._moved(rows), weight) for rows, start in self.parts]
         )
@@ -127,13 +126,13 @@ class Run:
 
     @cached_property
     def creep(self) -> Floats:
-        """(M, M) what creep of an even spectrum adds at each map of what stood at all, per unit of creep rate."""
+        """(M, M) creep at each map (row) from the shape of each map (column): even spectrum, per unit of creep rate."""
         return self.crept(np.eye(len(self.time)))
 
     @cached_property
     def figure(self) -> Floats:
-        """(M, 1 + 2 parts) columns of the figure: constant, old creep that fades, drift; a step and fading of each
-        further part.
+        """(M, 1 + 2 parts) columns of the figure: constant, fading of old creep, drift; then step and fading of each
+        resumed part.
         """
         (rows, start), *resumed = self.parts
         passed = np.diff(self.time, prepend=self.time[0])
@@ -151,7 +150,7 @@ class Run:
         return np.column_stack(columns)
 
     def gains(self, effective: Floats, keep: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """Gains (N, D) of effective signals (M, N) by the rows in `keep` (M,), and what they leave of all (M, D), m."""
+        """Gains (N, D) of effective signals (M, N), fitted to the rows in `keep` (M,), and all residuals (M, D), m."""
         design, values = np.hstack((self.figure, effective)), self.responses.values
         solution: Floats = np.asarray(np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0], dtype=np.float64)
         return solution[self.figure.shape[1] :], values - design @ solution
@@ -170,11 +169,11 @@ def run_of(maps: MapSet) -> Run:
 
 
 def basis_of(columns: Floats) -> Floats:
-    """Orthonormal columns that span `columns`, which may be 0 or alike in the rows at hand."""
+    """Orthonormal columns that span `columns`, some of which may be 0 or dependent in the rows at hand."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, size > 1e-9 * size[0]])
 
 
 def without(rows: Floats, free: Floats) -> Floats:
-    """`rows` (M, ...) less what the orthonormal columns `free` (M, C) explain."""
+    """`rows` (M, ...) less their projection onto the orthonormal columns `free` (M, C)."""
     return rows - np.tensordot(free, np.tensordot(free.T, rows, 1), 1)

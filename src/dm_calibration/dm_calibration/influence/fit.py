@@ -50,11 +50,11 @@ class InfluenceFit:
         in_sample_rms: rms sag over all maps used, m.
         held_out_rms: the same for maps predicted from a fit that has not seen them, m.
         held_out_max_zernike: 95th percentile over held-out maps of the largest coefficient error without piston and
-            tilt, m; with what all actuators may miss together where the maps show hysteresis and no law follows it.
+            tilt, m; plus the joint error of all actuators where the maps show hysteresis that no law describes.
         condition_number: of influence_zernike without piston (and without tilt when the maps do not show it).
         response: (N,) rms sag of a unit signal, m.
         standard_error: (N,) of the response, m.
-        signal_covariance: (N, N) of each row of G, for coefficients of unit variance.
+        signal_covariance: (N, N) covariance of each row of G, for coefficients of unit variance.
         grades: (N,) quality.GRADE_*.
         drift_rms: rms sag of the figure about its mean over the run, m.
         limitations: sentences a user of the result must know.
@@ -99,7 +99,7 @@ def fit_influence(
 
     Args:
         rings: (N,) ring of each actuator, for the grades; None = all are compared with each other.
-        limits: of the signals, where hysteresis is not followed: the error allows for it; None = it does not.
+        limits: of the signals, if no law describes hysteresis: the error then allows for it; None = it does not.
 
     Raises:
         UnknownNameError: an unknown method or label, listing the near ones.
@@ -131,7 +131,7 @@ def fit_influence(
             break
     remarks = []
     if options.method == "AZWreg":
-        # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
+        # The weights do not change which maps are outliers: these are found in the sag, without weights.
         filled = fitted.responses[:, maps.terms :]
         weighting = choose_weighting(fitted.design, fitted.maps, filled, options.folds, options.epsilon)
         responses = np.hstack((weighted_coefficients(fitted.maps, filled, weighting.weights), filled))
@@ -146,7 +146,7 @@ def fit_influence(
 
 
 class _Fitted(NamedTuple):
-    """Which maps (M,) are used, these maps, the design of their regression, what comes of it, and its responses."""
+    """Which maps (M,) are used, these maps, the design of their regression, its result and its responses."""
 
     used: NDArray[np.bool_]
     maps: MapSet
@@ -157,10 +157,10 @@ class _Fitted(NamedTuple):
     def worst_outlier(self, options: FitOptions) -> tuple[int, str] | None:
         """The map that stands out most from the fit, with the reason; None when none does.
 
-        A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A
-        map is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can
-        explain: an allowance for the actuators moved, added up without coherence. A small move carries the remanence of
-        larger ones before it, so the largest move up to then counts.
+        A fit follows maps of high leverage more closely; residual / sqrt(1 - leverage) compensates for that. A map is
+        an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can explain: an
+        allowance for each moved actuator, added in quadrature. A small move carries the remanence of larger ones before
+        it, so the largest move so far counts.
         """
         maps, regression, weight = self.maps, self.regression, self.maps.points.weight
         judged = regression.leverage < screening.LEVERAGE_MAX
@@ -180,8 +180,8 @@ class _Fitted(NamedTuple):
         outside = scaled > limit
         if not outside.any():
             return None
-        # The square of this is what leaving the map out takes off the sum of squares. A bad map of great leverage pulls
-        # good ones out of their (narrower) limits, but takes off most itself.
+        # Its square is what the sum of squares loses without the map. A bad map of high leverage pushes good ones
+        # beyond their (narrower) limits, but its own removal reduces the sum most.
         worst = int(np.argmax(np.where(outside, scaled, 0.0)))
         size, most = 1e9 * scaled[worst], 1e9 * limit[worst]
         return worst, f"outlier: {size:.1f} nm rms from what the maps together say, limit {most:.1f} nm"

@@ -15,20 +15,20 @@ from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
 
-#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
+#: Assumed time from the end of a degauss to the first map, s, where it is not known; such young creep is soon gone.
 BEFORE_FIRST_MAP_S = 1.0
-#: Fewest pairs of maps of the same command that tell the noise.
+#: Fewest pairs of maps of the same command from which the noise is estimated.
 PAIRS_MIN = 3
 
 
 class StepKind(StrEnum):
-    """What a step of a calibration does; those that end with a map give it its kind."""
+    """What a step of a calibration does; a step that ends with a map gives the map its kind."""
 
     REFERENCE = "reference"
     POKE = "poke"
     SURFACE = "surface"
     EXCITATION = "excitation"
-    #: Of hysteresis too, as in use: about the flat mirror.
+    #: Also excites hysteresis, with a shape as in use: about the flat mirror.
     IN_USE = "in_use"
     CHECK = "check"
     #: At rest, after a degauss in the course of a run.
@@ -106,7 +106,7 @@ class MapSet:
 
     @property
     def degaussed(self) -> NDArray[np.bool_]:
-        """(M,) before which maps the mirror was degaussed in the course of the run."""
+        """(M,) maps before which the mirror was degaussed in the course of the run."""
         again = np.concatenate(([False], np.diff(self.step) == 0))
         return np.array([kind == StepKind.DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
@@ -119,8 +119,8 @@ class MapSet:
         return round(float(np.median(self.applied[self.reference])), 4) if self.reference.any() else 0.0
 
     def moved_s(self) -> Floats:
-        """(M,) s since the first map: when the mirror took each shape; right after the map before, or the degauss
-        before the first, where not known, and after a degauss, while which creep follows the middle of its swings.
+        """(M,) s since the first map: when the mirror took each shape. Where that is not known, and after a degauss
+        (creep follows the middle of its swings): right after the map before, or the degauss before the first map.
         """
         before = np.concatenate((self.stamp_ns[:1] - round(1e9 * BEFORE_FIRST_MAP_S), self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
@@ -130,7 +130,7 @@ class MapSet:
         return np.asarray(1e-9 * (np.where(plausible, self.moved_ns, before) - self.stamp_ns[0]))
 
     def noise_variance(self) -> Floats:
-        """(K - 3,) m^2 of the coefficients of one map, from maps of the same command that follow each other; 0 where
+        """(K - 3,) m^2, variance of the coefficients of one map, from successive maps of the same command; 0 if
         these are too few.
         """
         same = (np.diff(self.applied, axis=0) == 0.0).all(axis=1) & (np.diff(self.segment) == 0) & ~self.degaussed[1:]
@@ -140,7 +140,7 @@ class MapSet:
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
-        """Names of the fields with one entry a map."""
+        """Names of the fields with one entry per map."""
         return tuple(field.name for field in fields(cls) if field.name != "points")
 
     @classmethod

@@ -1,7 +1,7 @@
 """Compare wiring and mounting with the configuration, from how the surface answers to each actuator.
 
-How the mirror stands in the maps as a whole is told first (:mod:`~dm_calibration.influence.registration`); what is left
-then belongs to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
+The pose of the whole mirror in the maps is found first (:mod:`~dm_calibration.influence.registration`). Differences
+that remain belong to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from dm_common.optics.sampling import SamplePoints
 
 Indices = NDArray[np.int64]
 
-#: The mirror stands as configured within these: rad, share of the pitch, relative.
+#: Turn (rad), shift (share of the pitch) and relative change of scale that still count as configured.
 TURN_MAX = np.radians(1.5)
 SHIFT_MAX = 0.1
 SCALE_MAX = 0.03
@@ -25,17 +25,17 @@ SCALE_MAX = 0.03
 PLACE_MARGIN = 0.08
 #: A response that correlates less than this with any bump is not that of one actuator.
 LIKENESS_MIN = 0.4
-#: Half of the responses must correlate so much with the bumps expected, else they are of another arrangement.
+#: Least median correlation of the responses with the expected bumps; below it the arrangement is another one.
 FIT_MIN = 0.75
-#: Two bumps explain a response where they leave no more than this share of what one leaves, in squares, ...
+#: Two bumps explain a response if they leave less than this share of the squared residual of one bump, ...
 DOUBLED = 0.5
 #: ... and the smaller of them is at least this share of the larger.
 SECOND_MIN = 0.4
 #: An actuator is weak below this share of the median response of its ring, ...
 WEAK_SHARE = 0.4
-#: ... and of the rings beside it where fewer than this answer: half of them may be weak, and the centre is alone.
+#: ... widened by the rings beside it until this many answer: half of a ring may be weak, and the centre is alone.
 COMPARED_MIN = 11
-#: Fewest actuators that must answer, and share of them below which the pokes are too small.
+#: Fewest actuators that must answer, and the share of them below which the pokes are too small.
 ANSWERS_MIN = 3
 ANSWERS_SHARE = 0.5
 
@@ -45,9 +45,9 @@ class PokeCheck:
     """Outcome of a poke check.
 
     Attributes:
-        registration: how the mirror stands in the maps; None = not known.
+        registration: pose of the mirror in the maps; None = not known.
         place: (N,) 0-based index of the configured actuator over whose place actuator i raised the surface.
-        turned: whether the mirror stands turned, mirrored or shifted beyond what counts as configured.
+        turned: whether the mirror is turned, mirrored or shifted by more than what counts as configured.
         findings: sentences; empty = wiring and orientation are as configured.
     """
 
@@ -58,7 +58,7 @@ class PokeCheck:
 
     @property
     def pose(self) -> str:
-        """How the mirror stands in the maps, with standard errors."""
+        """Pose of the mirror in the maps, with standard errors."""
         found = self.registration
         if found is None:
             return "not known how the mirror stands"
@@ -111,7 +111,7 @@ def check_pokes(
         )
         return replace(nothing, findings=(problem, *findings))
     single, double = active, {}
-    for _ in range(2):  # again without those that move two places, which would bend it
+    for _ in range(2):  # again without those that move two places, which would distort it
         stands = register(unit[single], single, points, x, y, radius)
         if stands is None:
             problem = (
@@ -148,7 +148,7 @@ def check_pokes(
 
 
 def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
-    """What of `found` stands otherwise than configured: sentences, and whether parameters of the maps cure it."""
+    """Sentences on how `found` differs from the configuration, and whether parameters of the maps correct that."""
     parts = []
     turn, sigma = np.degrees(found.turn), np.degrees(found.turn_sigma)
     if abs(found.turn) > TURN_MAX + 3.0 * found.turn_sigma:
@@ -169,9 +169,9 @@ def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
 
 
 def _places(table: Floats, active: Indices, double: dict[int, tuple[int, int]]) -> Indices:
-    """(N,) the place of each actuator; moves that do not fit clearly better than staying are not believed."""
+    """(N,) the place of each actuator; places other than its own count only where they fit clearly better."""
     table = table.copy()
-    for actuator, pair in double.items():  # one of its two, its own where it can be
+    for actuator, pair in double.items():  # its own place if that is one of the two, else the first
         table[actuator] = np.arange(len(table)) == (actuator if actuator in pair else pair[0])
     count = table.shape[1]
     place = np.full(count, -1)
@@ -191,7 +191,7 @@ def _places(table: Floats, active: Indices, double: dict[int, tuple[int, int]]) 
 
 
 def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[int, int]]:
-    """Actuators that raise two places at once, and which.
+    """Actuators that raise two places at once, with these places.
 
     Args:
         table: (N, N) correlations of each response with the bumps expected at each place.
@@ -202,8 +202,8 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
     apart = ~np.eye(len(overlap), dtype=bool)
     determinant = np.where(apart, 1.0 - np.square(overlap), 1.0)
     for actuator, row in enumerate(table):
-        first = (row[:, None] - overlap * row) / determinant  # [j, k] of the bump at j beside one at k
-        explained = first * row[:, None] + first.T * row  # by both, in squares
+        first = (row[:, None] - overlap * row) / determinant  # [j, k]: of the bump at j if one at k is fitted too
+        explained = first * row[:, None] + first.T * row  # by both bumps, as a sum of squares
         rise = first / height[:, None]
         both = (rise * rise.T > 0.0) & (abs(rise) >= SECOND_MIN * abs(rise.T)) & (abs(rise.T) >= SECOND_MIN * abs(rise))
         explained[~(both & apart)] = 0.0
@@ -214,7 +214,7 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
 
 
 def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Actuators below WEAK_SHARE of their ring, both as they are and for how far from the aperture they stand."""
+    """Actuators below WEAK_SHARE of their ring, both as measured and relative to the bump expected at their place."""
     weak = counted.copy()
     for number in np.unique(ring[counted]):
         steps = np.abs(ring - number)

@@ -1,4 +1,4 @@
-"""The parameters that put right what a poke check found to stand otherwise than configured."""
+"""The parameters that correct what a poke check found to differ from the configuration."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,10 +18,10 @@ Changes = Mapping[str, Mapping[str, Any]]
 
 
 def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Sequence[int]) -> tuple[Changes, str]:
-    """What to set so that the poke check passes; dead, weak and doubled actuators, signs and scale it cannot cure.
+    """What to set so that the poke check passes; it cannot cure dead, weak and doubled actuators, signs and scale.
 
-    The turn and image of the mirror go into the orientation of the maps, so that a calibration, which lies in the frame
-    of the configured positions, holds on when the mirror or the camera is turned.
+    The turn and image of the mirror go into the orientation of the maps. A calibration is made in the frame of the
+    configured positions, so it remains valid when the mirror or the camera is turned.
 
     Args:
         last: a map of the run.
@@ -40,11 +40,11 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
             "orientation.flip_y": orientation.flip_y,
             "orientation.rotate_deg": round(orientation.rotate_deg, 2),
         }
-        # Without a lateral resolution of its own the valid region counts as the mirror's aperture.
+        # Without a lateral resolution of the map its valid region is taken to be the mirror's aperture.
         metres = last.pitch or (mirror.working_radius / last.radius_px if last.radius_px else 0.0)
         middle = 0.5 * (np.array(last.camera) - 1.0)
         follow = any(last.followed)
-        # From the centre of the map, about which the orientation turns, and from what the parameters count from.
+        # From the centre of the map, about which the orientation turns, and from the origin of the parameters.
         seen, centre = (
             complex(last.centre[0] - origin[0], origin[1] - last.centre[1]) * metres + complex(*found.shift)
             for origin in (middle, last.followed if follow else middle)

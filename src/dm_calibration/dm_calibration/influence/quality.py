@@ -16,17 +16,17 @@ EXTRAPOLATION_MAX = 10.0
 #: Share of the median response of all excited actuators below which one is dead.
 DEAD_SHARE = 0.02
 
-#: An actuator is uncertain when its relative error is so many times that of the others: an error that all share, as
-#: hysteresis makes it in pokes, says nothing of one of them.
+#: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, as
+#: hysteresis causes in pokes, is no sign of a bad actuator.
 STANDS_OUT = 2.0
 
-#: Maps show hysteresis that no law describes from this share of their moves on; what is less may be noise.
+#: Maps show hysteresis that no law describes if they miss at least this share of their moves; less may be noise.
 LOOPS_SHOW = 0.01
-#: Least size of a move, m: a map at mid range shows no share of one.
+#: Least size of a move as a divisor, m: maps at mid range have no move.
 NO_MOVE = 1e-15
-#: Moves in use go up to twice as far as those of pokes, and loops widen with the way, ...
+#: Factor from pokes to moves in use: these go up to twice as far, and loops widen with the distance, ...
 LOOPS_WIDEN = 2.0
-#: ... but not beyond this, in what single actuators are allowed to miss: together they err alike.
+#: ... but to no more than this many times the allowance of a single actuator: all actuators err alike.
 LOOPS_WIDEST = 1.5
 
 # Values of dm_msgs/Calibration.actuator_grade.
@@ -74,7 +74,7 @@ def _typical(uncertainty: Floats, excited: NDArray[np.bool_]) -> float:
 
 
 def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], weak_sigmas: float) -> list[str]:
-    """What is to be said of responses (N,) that are all uncertain, in sentences."""
+    """Sentences on responses (N,) that are all uncertain; empty if they are not."""
     typical = _typical(_relative(response, standard_error), excited)
     if typical * weak_sigmas < 1.0:
         return []
@@ -96,7 +96,7 @@ def held_out_residual(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Residual of each map predicted from a fit that has not seen it, by k-fold cross-validation.
 
-    Folds go by commanded state, so that repeated maps of a state leave together, and are dealt out in order: the two
+    Folds go by commanded state, so that repeated maps of a state stay together, and are dealt out in order: the two
     directions of a push-pull poke lie in different folds. Reference frames stay in every fit: without them the figure
     of the day would be extrapolated, which is not what the influence function is judged by.
 
@@ -116,7 +116,7 @@ def held_out_residual(
     inflation = np.full(step.size, np.inf)
     for k in range(int(fold.max(initial=-1)) + 1):
         left_out = fold == k
-        # Where a fold holds the only map that tells two actuators apart, this is the smallest solution.
+        # Where a fold holds the only map that separates two actuators, this is the minimum-norm solution.
         inverse = np.linalg.pinv(design.matrix[~left_out], rcond=1e-9)
         residual[left_out] = responses[left_out] - design.matrix[left_out] @ (inverse @ responses[~left_out])
         inflation[left_out] = np.square(design.matrix[left_out] @ inverse).sum(axis=1)
@@ -127,14 +127,14 @@ def held_out_residual(
 
 
 def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.bool_], allowance: float) -> float:
-    """Share of a move over the range by which hysteresis may make it miss where no law describes it.
+    """Error by hysteresis that no law describes, as a share of a move over the range.
 
-    One poke shows its own actuator's loop only, so what is left of held-out pokes says less than what all actuators
-    miss together. A map counts by what it misses the way of its move, against the largest move up to then, which may
-    have left a remanence.
+    A poke shows only the loop of its own actuator, so the residuals of held-out pokes are smaller than what all
+    actuators miss together. Each map counts with its residual along its own move, relative to the largest move so far,
+    which may have left a remanence.
 
     Args:
-        left, moved: (M, P) m, sag of the held-out residuals, and that the signals make from mid range on.
+        left, moved: (M, P) m, sag of the held-out residuals, and sag by the signals relative to mid range.
         tested: (M,) which maps count.
         allowance: share of an actuator's move by which it may miss.
     """
@@ -145,7 +145,7 @@ def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.b
 
 
 def with_loops(error: float, share: float, influence_zernike: Floats, limits: Limits) -> tuple[float, list[str]]:
-    """`error` (m) with what `share` of a move makes of the largest sphere inside `limits`, and that in a sentence.
+    """`error` (m) plus `share` of the defocus of the largest sphere inside `limits`, and a sentence on that.
 
     Args:
         influence_zernike: (K, N).
@@ -165,7 +165,7 @@ def with_loops(error: float, share: float, influence_zernike: Floats, limits: Li
 def seen_rms(residual: Floats, sag: Floats, weight: Floats) -> Floats:
     """(M,) m, rms of the residuals (M, P) over the points at which each map (M, P) has data.
 
-    Points that the fit has filled follow it, and tell nothing of its error.
+    Points that were filled from the fit follow it and show nothing of its error.
     """
     seen = np.isfinite(sag)
     return np.asarray(np.sqrt((np.square(residual) * seen) @ weight / (seen @ weight)))

@@ -4,8 +4,8 @@ See :mod:`~dm_calibration.influence.weights` for where weights act; this is its 
 
 Epsilon. In [1] it is a prior parameter. As epsilon goes from 0 to infinity the weights go from w_i ~ 1/r_i (the common
 factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is chosen whose
-influence function predicts maps it has not seen best, in the measure by which [1] judges: the rms surface error inside
-the ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is part of the
+influence function best predicts maps it has not seen, by the measure that [1] uses: the rms surface error inside the
+ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is part of the
 prediction. Weights of a fold come from the other folds alone. Where no weights predict better than equal ones, the
 mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
 """
@@ -28,7 +28,7 @@ from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 EPSILON_CANDIDATES: tuple[float, ...] = tuple(10.0 ** (k / 3.0) for k in range(-6, 7))
 #: Standard deviation of regional errors, relative to their mean, below which they count as constant over the surfaces.
 CONSTANT = 1e-9
-#: Fewest sample surfaces: without a fold of two, two must be left to take a variance over.
+#: Fewest sample surfaces: if a fold of two is left out, two must remain for a variance.
 SURFACES_MIN = 4
 
 
@@ -85,7 +85,7 @@ def choose_weighting(
 ) -> RegionWeighting:
     """Region weights of `maps` with epsilon by k-fold cross-validation, or with a given one.
 
-    Folds go by commanded state in order, so that they are the same in every run and repeated maps leave together.
+    Folds go by commanded state in order, so that they are the same in every run and repeated maps stay together.
 
     Args:
         design: of these maps, (M, p).
@@ -102,7 +102,7 @@ def choose_weighting(
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
     chosen = sample_surfaces(maps)
-    # `sag` has its gaps filled from a fit: a region that nobody saw would get its weight from what was made up.
+    # The gaps of `sag` were filled from a fit: a region without data would get its weight from filled values.
     regional_rms(maps.sag[chosen], maps.points, labels=maps.select(chosen).label)
     states = np.unique(maps.step[chosen]).size
     if states < SURFACES_MIN:
@@ -115,7 +115,7 @@ def choose_weighting(
     variance = _variance(design, maps, sag, chosen)
     scale = float(np.median(variance))
 
-    # Which held-out predictions are extrapolation does not depend on the responses: any column tells.
+    # Which held-out predictions are extrapolation does not depend on the responses, so any column will do.
     _, tested = quality.held_out_residual(design, sag[:, :1], maps.step, chosen, folds)
     tested = tested if tested.any() else chosen
     squares = np.zeros(fractions.size)
@@ -176,7 +176,7 @@ def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
         weights: (R,) of the regions.
     """
     coefficients = sag @ coefficient_operator(maps.points, weights).T
-    # What was removed is a plane, which any weights fit exactly.
+    # What was removed from the sag is a plane, which is fitted exactly with any weights.
     plane = basis(maps.points.x, maps.points.y)[:, :PISTON_TILT]
     coefficients[:, :PISTON_TILT] += weighted_fit(maps.sag - sag, plane, maps.points.weight)
     return np.asarray(coefficients)

@@ -1,12 +1,12 @@
-"""How the mirror stands in the maps: turn, mirror image, shift, scale and numbering, in one estimate from its pokes.
+"""Pose of the mirror in the maps: turn, mirror image, shift, scale and numbering, in one estimate from its pokes.
 
-A poke raises a broad bump over its actuator. Each bump is located by itself, the places are assigned one to one to the
-configured ones (Hungarian method) under a similarity that is fitted in turn (iterative closest point) from starts all
-around, and the similarity found is refined on the maps themselves.
+A poke raises a broad bump over its actuator. Each bump is located by itself. The bumps are assigned one to one to the
+configured places (Hungarian method), alternating with the fit of a similarity (iterative closest point), from starts
+all around; the best similarity is refined on the maps themselves.
 
-A regular arrangement looks the same after some turns: then a turned mirror cannot be told from one whose numbering
-begins elsewhere. Of the descriptions that fit alike, the one that leaves most actuators where they are configured
-holds, and among those that do so alike the one nearest to the configuration.
+A regular arrangement looks the same after some turns: then a turned mirror cannot be distinguished from one whose
+numbering begins elsewhere. Of the descriptions that fit equally well, the one is taken that leaves most actuators where
+they are configured, and among several of these the one nearest to the configuration.
 """
 
 from dataclasses import dataclass
@@ -30,35 +30,35 @@ WIDTHS = (0.5, 0.7, 0.9, 1.15, 1.5)
 REACH = 1.45
 #: ... on a grid of this spacing, in pitches.
 GRID = 0.25
-#: Starts of the search, all around, for each image and scale.
+#: Angles around the full circle at which the search starts, for each image and scale.
 STARTS = 36
 #: Places in the middle over which the innermost bump may lie: one and its neighbours.
 ANCHORS = 7
-#: Those that lie best are followed: a hexagonal arrangement looks the same in twelve positions.
+#: Number of best starts that are followed: a hexagonal arrangement looks the same in twelve positions.
 TRIED = 36
 ROUNDS = 20
 #: A bump further than this from every configured place, in pitches, belongs to none.
 TOLERANCE = 0.7
-#: Bumps nearer to each other than this, in pitches, are of one place.
+#: Bumps nearer to each other than this, in pitches, belong to one place.
 TOGETHER = 0.5
-#: Fewest places that tell a turn from a mirror image.
+#: Fewest places that distinguish a turn from a mirror image.
 PLACES_MIN = 3
 #: Descriptions whose mean square distances differ by less than this, in square pitches, fit alike.
 ALIKE = 0.02
-#: Among those, this share of the actuators more in place is worth another turn.
+#: Among those, up to this share of the actuators more may be out of place for a smaller turn.
 SHARE = 0.25
 #: Actuators nearer to the centroid than this share of the outermost are used for the refinement: those at the rim
-#: answer otherwise, since the plate ends there.
+#: respond differently, since the plate ends there.
 INNER = 0.72
 INNER_MIN = 6
-#: What bumps of another shape than the expected do to scale and shift, relatively.
+#: Relative errors of scale and shift due to bumps of another shape than expected.
 SCALE_BIAS = 0.005
 SHIFT_BIAS = 0.02
 
 
 @dataclass(frozen=True)
 class Registration:
-    """How the mirror stands in the maps, against the configuration.
+    """Pose of the mirror in the maps, relative to the configuration.
 
     An actuator configured at p is seen at ``scale * turn(turn, image(p)) + shift``; the image exchanges left and right.
 
@@ -107,7 +107,7 @@ def _seen(similarity: _Similarity, places: Places) -> Places:
 
 
 def bumps(places: Places, width: float, points: SamplePoints) -> tuple[Floats, Floats]:
-    """Bumps of unit height at `places` (N,), `width` as they in radii of the aperture: see :func:`unit_responses`."""
+    """Bumps of unit height at `places` (N,), in radii of the aperture as is `width`: see :func:`unit_responses`."""
     distance = np.abs(places[:, None] - (points.x + 1j * points.y))
     return unit_responses(np.exp(-0.5 * np.square(distance / width)), points)
 
@@ -122,8 +122,8 @@ def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
 def register(
     unit: Floats, active: NDArray[np.int64], points: SamplePoints, x: Floats, y: Floats, radius: float
 ) -> Registration | None:
-    """Find how the mirror stands in the maps; where the responses are of something else, it is what fits least badly.
-    None where all lie over one place or two.
+    """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
+    all of them lie over one place or two.
 
     Args:
         unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
@@ -163,7 +163,7 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
     ]
     nearest = [np.abs(_seen(start, places)[:, None] - seen).min(axis=0) / step for start in starts]
     order = np.argsort([np.mean(np.minimum(distance, TOLERANCE) ** 2) for distance in nearest], kind="stable")
-    # Few bumps fit many turns: as configured is one of them.
+    # A few bumps fit many turns, so the configured position is always tried.
     own = _Similarity(1.0 + 0j, complex((seen - places[active]).mean()), False)
     matches = [_closest(seen, places, start, step) for start in (own, *(starts[index] for index in order[:TRIED]))]
     least = min(match.distance for match in matches)
@@ -175,8 +175,8 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
 
 
 def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> list[_Similarity]:
-    """The similarities of this `factor` that put the centroids over each other, and, where actuators are missing so
-    that these are not the same, the innermost bump over the places in the middle.
+    """The similarities with this `factor` that superpose the centroids, and, where actuators are missing so that the
+    centroids differ, those that put the innermost bump over one of the places in the middle.
     """
     images = _seen(_Similarity(factor, 0j, mirrored), places)
     shifts = [seen.mean() - images.mean()]
@@ -228,7 +228,7 @@ def _refined(
     fitted = least_squares(lambda values: residual(values, use).ravel(), start)
     left = np.linalg.norm(fitted.fun.reshape(-1, len(points)), axis=1)
     good = left <= 3.0 * np.median(left)
-    if not good.all() and good.sum() >= 3:  # again without those that answer otherwise
+    if not good.all() and good.sum() >= 3:  # again without those that respond differently
         use[np.flatnonzero(use)[~good]] = False
         fitted = least_squares(lambda values: residual(values, use).ravel(), fitted.x)
     sigma = _standard_errors(fitted.jac.reshape(-1, len(points), start.size), fitted.fun.reshape(-1, len(points)))
@@ -247,7 +247,7 @@ def _refined(
 
 
 def _standard_errors(jacobian: Floats, residual: Floats) -> Floats:
-    """Of parameters K, from the scatter between actuators A: jacobian (A, P, K), residual (A, P).
+    """(K,) standard errors, from the scatter between actuators A: jacobian (A, P, K), residual (A, P).
 
     Neighbouring points of one response err alike, so each actuator counts as one observation.
     """

@@ -34,9 +34,9 @@ METHODS = ("AZreg", "AZWreg")
 EXCITATION_MIN = 0.0199
 #: Maps beyond the number of unknowns before the drift is followed; with fewer, the figure is taken as constant.
 DRIFT_SPARE_MAPS = 5
-#: Smallest singular value of the design, relative to the largest, that still tells actuators apart.
+#: Smallest singular value of the design, relative to the largest, that still separates the actuators.
 RANK_TOLERANCE = 1e-7
-#: Least share of a direction of the unknowns that the maps which see a point must hold to determine it there.
+#: Least share of the information on any combination of unknowns that must remain in the maps which see a point.
 SEEN_MIN = 1e-6
 #: Rounds in which sampling points without data are filled from the fit, and the change in m that ends them sooner.
 GAP_ROUNDS = 60
@@ -91,7 +91,7 @@ def drift_columns(stamp_ns: NDArray[np.int64], reference: NDArray[np.bool_], ste
 
     Repeated maps of a state, which follow each other, share its knot. Before the first and after the last knot the
     figure is taken as constant. Rows sum to 1. With fewer than two knots there is one column of ones: a constant
-    figure. When the clock was set back during the run, the order of the maps stands for the time.
+    figure. When the clock was set back during the run, the order of the maps is used as time.
 
     Args:
         step: (M,) index of the commanded state.
@@ -161,7 +161,7 @@ def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats
     """Which maps hold data (M,), and their sag (M, P) m with piston and tilt removed; that of the others is zero.
 
     Args:
-        model: (M, P) m, sag to fill points without data from.
+        model: (M, P) m, sag used to fill points without data.
     """
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
     sag = np.zeros_like(maps.sag)
@@ -170,10 +170,10 @@ def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats
 
 
 class SeenAlike(NamedTuple):
-    """Sampling points that the same maps have seen, by index; p unknowns, L maps without data there.
+    """Sampling points with data in the same maps, by index; p unknowns, L maps without data there.
 
     Attributes:
-        lost: (L, p) their rows of the orthonormal basis of the design.
+        lost: (L, p) rows of these L maps in the orthonormal basis of the design.
         inverse: (L, L) of 1 - lost lost^T; None where the other maps do not determine the unknowns.
     """
 
@@ -183,7 +183,7 @@ class SeenAlike(NamedTuple):
 
 
 def seen_alike(design: Design, seen: NDArray[np.bool_]) -> list[SeenAlike]:
-    """All sampling points, sorted by which maps `seen` (M, P) have data there."""
+    """All sampling points, grouped by the set of maps that have data there, `seen` (M, P)."""
     _, first, which = np.unique(np.packbits(seen, axis=0), axis=1, return_index=True, return_inverse=True)
     found = []
     for number, rows in enumerate(seen[:, first].T):
@@ -197,9 +197,9 @@ def seen_alike(design: Design, seen: NDArray[np.bool_]) -> list[SeenAlike]:
 def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 
-    A point's fit is that to the maps which have seen it; the rounds are for piston and tilt of the maps, which go with
-    what is filled in. Where these maps do not determine the unknowns, what is filled in has its say, as in the
-    expectation-maximisation form of least squares with missing data, and begins from the terms of the maps.
+    The fit at a point is that to the maps with data there; rounds are needed because piston and tilt of a map depend on
+    its filled points. Where these maps do not determine the unknowns, filled values take part in the fit, as in the
+    expectation-maximisation form of least squares with missing data; they start from the terms of the maps.
 
     Returns:
         The regression, and its responses (M, K + P): coefficients, and sag without gaps, piston and tilt, m.

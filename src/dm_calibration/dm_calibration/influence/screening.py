@@ -1,4 +1,4 @@
-"""Which maps are fit for the regression, and why the others are not; the options that say so."""
+"""Which maps can enter the regression, and why the others cannot; the options of the fit."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from dm_common.values import live_parameter, real
 
 #: Median absolute deviation to standard deviation, for normal errors.
 MAD_TO_SIGMA = 1.4826
-#: Maps with a leverage above this fix something alone: their own residual says nothing about them.
+#: A map with a leverage above this determines an unknown alone: its residual says nothing about it.
 LEVERAGE_MAX = 0.95
 #: Largest share of sampling points without data.
 MISSING_POINTS_MAX = 0.2
@@ -22,7 +22,7 @@ DROPPED_MAX = 0.25
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit, and from where on maps and actuators are no good.
+    """How to fit, and the thresholds beyond which maps and actuators are bad.
 
     Attributes:
         method: a name of METHODS.

@@ -29,8 +29,8 @@ ZERNIKE_INDEX = tuple(index for index, term in enumerate(TERMS) if term.n and te
 ZERNIKE_NAMES = tuple(TERMS[index].name.removesuffix(" cos") for index in ZERNIKE_INDEX)
 #: Amplitude of the Zernike surfaces as a share of the largest one the limits allow.
 ZERNIKE_SHARE = 0.5
-#: Weight of small signals in the solve, relative to the influence function: keeps noise from driving the actuators
-#: that the aperture hardly shows, and costs a shape less than 1 % of its residual.
+#: Damping of the signals towards mid range, relative to the largest singular value of the influence function: keeps
+#: noise from driving actuators that the aperture hardly shows, and costs a shape less than 1 % of its residual.
 DAMPING = 1e-2
 
 _LEVELS = {"p01": -1.0, "p02": -0.5, "p03": 0.0, "p04": 0.5, "p05": 1.0}
@@ -126,7 +126,7 @@ def solve_shape(
     """Signals inside the range for the sag `target` (P,), m, by bounded least squares; piston and tilt are free.
 
     Args:
-        limits: to keep; None = the range alone: how far the shape must shrink for neighbours is for the caller to say.
+        limits: to keep; None = the range alone; the caller then scales the shape to the limit between neighbours.
 
     Returns:
         Signals (N,) and the rms sag that is left, m.
@@ -168,7 +168,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
         unit[index] = 1.0
         tilt = index < PISTON_TILT
         flat, _ = solve_shape(np.zeros(points.x.size), model, mirror)
-        # Of tilt in proportion to x, since the maps do not show it; else without bounds, scaled to them afterwards.
+        # Tilt: in proportion to x, since maps do not show it. Others: solved without bounds, scaled to them afterwards.
         plane = mirror.x / (np.abs(mirror.x).max() or 1.0)
         direction = plane if tilt else _unbounded(basis(points.x, points.y) @ unit, model)
         amplitude = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
@@ -189,7 +189,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
 
 
 def _damped(model: LinearModel) -> tuple[Floats, float]:
-    """(P + N, N) the influence function in sag, weighted by area, over the weight of small signals; and that weight."""
+    """(P + N, N) the influence function in sag, weighted by area, above N damping rows; and the damping."""
     matrix = np.sqrt(model.points.weight)[:, None] * remove_piston_tilt(model.influence_sag.T, model.points).T
     damping = DAMPING * float(np.linalg.norm(matrix, 2))
     return np.vstack((matrix, damping * np.eye(matrix.shape[1]))), damping

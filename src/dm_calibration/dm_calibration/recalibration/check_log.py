@@ -21,9 +21,9 @@ class Check:
         accepted: 1 = it agreed and was taken in.
         max_zernike: largest difference of a coefficient beyond tilt, m.
         rms: of the difference in sag, m.
-        surprise: difference over its expected size.
-        gain_drift: largest relative change of a gain since the calibration was made, after this map, and ...
-        actuator: ... whose it is, from 1.
+        surprise: difference relative to its expected size.
+        gain_drift: largest relative change of a gain since the calibration was made, after this map.
+        actuator: the actuator of that gain, from 1.
         offset_drift: change of the figure since then, m rms.
     """
 
@@ -38,7 +38,7 @@ class Check:
 
     @classmethod
     def of(cls, stamp_ns: int, accepted: bool, shown: Comparison, drift: Drift) -> Self:
-        """The check of a map taken at `stamp_ns`, and the drift as it is used after it."""
+        """The check of a map taken at `stamp_ns`, with the drift as it is used after this map."""
         gain, actuator = drift.largest_gain
         departure = shown.max_zernike, shown.rms, shown.surprise
         return cls(1e-9 * stamp_ns, int(accepted), *departure, gain, actuator + 1, drift.offset_rms)

@@ -1,4 +1,4 @@
-"""Which single actuators a map that disagrees comes from, how probable that is, and where they stand."""
+"""Find the single actuators that explain a disagreeing map, how probable that is, and where they stand."""
 
 from collections.abc import Mapping
 
@@ -17,18 +17,18 @@ from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, basis
 
-#: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
-#: that fits noise best explains about 0.13.
+#: Most actuators to which a difference is attributed, and the least share of its sum of squares that each must explain:
+#: the actuator that fits pure noise best explains about 0.13.
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
-#: How far an actuator that stands elsewhere is from where it should be, normalised.
+#: Prior standard deviation of the displacement of a faulty actuator, in effective signal.
 DISPLACED_SIGMA = 0.5
-#: Smallest signal that tells a weak actuator from one that is displaced, and smallest move of one that showed no
-#: response in the calibration; what is left of the move of a dead one.
+#: Least signal at which a weak actuator can be distinguished from a displaced one, also least move of one without a
+#: response in the calibration; largest share of its move that a dead actuator still makes.
 TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
-#: What the data sheets of piezo mirrors say: rise of the surface over an actuator per unit signal, m, and the width of
-#: the bump, standard deviation in pitches.
+#: From data sheets of piezo mirrors: rise of the surface over an actuator per unit signal, m, and width of the bump
+#: (standard deviation, in pitches).
 TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
-#: Of this probability on it is named how to go on without what does not move.
+#: Least probability of a fault for which the message says how to go on without the actuator.
 SURE = 0.9
 
 
@@ -38,12 +38,12 @@ def without_response(calibration: Calibration) -> NDArray[np.bool_]:
 
 
 def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -> Floats:
-    """`gain` (R, N) per unit of effective signal, of actuators without a response as data sheets let expect.
+    """`gain` (R, N) per unit of effective signal, with the typical gain for actuators without a response.
 
-    The fit has nothing but noise of those, by which no map could show that they move.
+    For these the fit contains only noise, with which no map could show that they move.
     """
     silent = without_response(calibration)
-    if not silent.any() or silent.size < 2:  # no neighbour whose distance tells the width of a bump
+    if not silent.any() or silent.size < 2:  # no neighbour whose distance gives the width of a bump
         return gain
     radius = calibration.aperture_radius
     places = calibration.actuator_x / radius, calibration.actuator_y / radius
@@ -54,7 +54,7 @@ def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -
 def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
     """(N, 21) coefficients and (N, P) sag, m per unit signal, of actuators at x, y (N,), in radii of the aperture.
 
-    As the data sheet of a piezo mirror lets expect; piston and tilt of the sag are removed.
+    Typical of a piezo mirror, from its data sheet; piston and tilt of the sag are removed.
     """
     shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
     sag = TYPICAL_RISE * size[:, None] * shape
@@ -64,12 +64,12 @@ def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats
 def displaced_actuators(
     innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: NDArray[np.bool_]
 ) -> dict[int, Displaced]:
-    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares.
+    """Actuators whose displacement explains `innovation` (R,), found one by one by generalised least squares.
 
     Args:
         gain: (R, N) per unit of effective signal, see :func:`visible_gain`.
         factor: Cholesky factor of the expected covariance (R, R).
-        silent: (N,) whose gain is not known but as data sheets let expect.
+        silent: (N,) actuators without a measured gain, for which the typical gain is used.
     """
     white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
     columns, whole = white[:, :-1], white[:, -1]
@@ -84,7 +84,7 @@ def displaced_actuators(
         amounts = np.linalg.lstsq(columns[:, found], whole, rcond=None)[0]
         left = whole - columns[:, found] @ amounts
     size = np.abs(amounts)
-    # One without a response that moved so little is rather another shape than a bump that is not well known.
+    # Small moves of actuators without a response, whose bumps are not well known, are more likely other errors.
     order = [int(k) for k in np.argsort(-size) if size[k] >= TELLING_SIGNAL or not silent[found[k]]]
     displaced = {}
     for k in order:
@@ -95,11 +95,11 @@ def displaced_actuators(
 
 
 def _probability(columns: Floats, power: Floats, white: Floats, silent: NDArray[np.bool_]) -> Floats:
-    """(N,) that each actuator alone makes the difference `white` (R,), and neither another one nor something else.
+    """(N,) probability that each actuator alone causes the difference `white` (R,), against any other cause.
 
-    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does, or as much as
-    a `silent` actuator leaves of it, whose bump is not known. Half of the prior is the actuators', the other half that
-    of something else.
+    An actuator may be anywhere in its range. A cause other than an actuator changes all values, by an unknown amount
+    estimated from `white`; for a `silent` actuator, whose bump is not known, the same holds for what it leaves. The
+    prior is one half for all actuators together, and one half for other causes.
     """
     size, whole = len(white), white @ white
     precision = 1.0 / DISPLACED_SIGMA**2
@@ -112,14 +112,14 @@ def _probability(columns: Floats, power: Floats, white: Floats, silent: NDArray[
 
 
 def _of_anything(square: Floats, size: int) -> Floats:
-    """What a difference of that `square`, white, counts for where its size is not known, in `size` values."""
+    """-2 log likelihood of a white difference in `size` values with that sum of squares and unknown variance (>= 1)."""
     return np.where(square > size, size * (1.0 + np.log(np.maximum(square, size) / size)), square)
 
 
 def displacement(
     innovation: Floats, gain: Floats, factor: tuple[Floats, bool], actuators: list[int]
 ) -> tuple[Floats, Floats]:
-    """How far each of `actuators` stands from where it should, and its standard deviation.
+    """Distance of each of `actuators` from where it should stand, in effective signal, and its standard deviation.
 
     By generalised least squares; other args as those of :func:`displaced_actuators`.
     """
@@ -131,10 +131,10 @@ def displacement(
 def described(
     displaced: Mapping[int, Displaced], expected: Floats, given_up: NDArray[np.bool_], silent: NDArray[np.bool_]
 ) -> str:
-    """What a map that disagrees shows, where actuators should stand at `expected` (N,).
+    """Describe what a disagreeing map shows, where actuators should stand at `expected` (N,).
 
     Args:
-        given_up: (N,) which have been taken not to move any more.
+        given_up: (N,) actuators that are already known not to move any more.
         silent: (N,) which showed no response in the calibration.
     """
     if not displaced:
@@ -163,12 +163,12 @@ def described(
 
 
 def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:
-    """Largest coefficient error of any other shape by actuators that stay where a map shows them, m.
+    """Largest coefficient error (m) over all other shapes if actuators stay where a map shows them.
 
-    One that stays where it is errs by as much as it is asked to move: at the far end of the range by most.
+    The error of a stuck actuator is the move it is asked to make, which is largest to the far end of the range.
 
     Args:
-        displaced: as :func:`displaced_actuators` finds them; those that are not sure do not count.
+        displaced: as found by :func:`displaced_actuators`; only those with a probability of at least SURE count.
         expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
         zernike: (K, N) m per unit of effective signal.
     """
@@ -180,7 +180,7 @@ def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernik
 
 
 def _fault(signal: float, more: float) -> str:
-    """What an actuator does that stands `more` beyond its effective `signal`; "" = no single map tells."""
+    """The fault of an actuator that stands `more` beyond its effective `signal`; "" = one map cannot show it."""
     if abs(signal) < TELLING_SIGNAL:
         return ""
     share = 1.0 + more / signal

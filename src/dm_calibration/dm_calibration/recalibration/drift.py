@@ -1,4 +1,4 @@
-"""What maps that came later have shown of a calibrated mirror."""
+"""What later maps have shown of a calibrated mirror."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.recipes import GOES_ON_WITHOUT
 from dm_common.values import live_parameter, parameter, real, whole
 
-#: For one K, known beforehand of a mirror that no map has shown warmer, standard deviations: relative change of all
-#: gains, and change of the figure, m rms.
+#: Prior standard deviations of the changes for 1 K, as long as no map was taken at another temperature: relative change
+#: of all gains, and change of the figure, m rms.
 WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 
 
@@ -22,7 +22,7 @@ class UpdateOptions:
     """Which maps are taken, and how far they may change the calibration.
 
     Attributes:
-        gain_rate, figure_rate: standard deviations. Half of the variance of gains is common.
+        gain_rate, figure_rate: standard deviations. Half of the variance of gains is common to all actuators.
         valid_fraction_min: least share of valid pixels.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
@@ -54,19 +54,19 @@ class Drift:
 
     Attributes:
         gain: (N,) relative changes.
-        offset: (R,) m rms, change of the figure that stays, in reduced values.
+        offset: (R,) m rms, permanent change of the figure, in reduced values.
         thermal: (1 + R,) per K: relative change of all gains, and m rms, change of the figure in reduced values.
         crept: (R,) m rms, change of the figure by slow creep at `stamp_ns`, in reduced values; it fades.
         covariance: (N + 3 R + 1, N + 3 R + 1) of gain, offset, thermal and crept.
-        stamp_ns: time it holds for.
-        revision: maps taken in.
+        stamp_ns: time for which these values hold.
+        revision: number of maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
-        surprising: maps in a row, the last ones, that disagreed.
-        disagreement: largest error (m) that these have shown, or that actuators they show make elsewhere.
-        evidence: (2, 2) sum of squares of the changes that were predicted of maps, in standard deviations, and of their
-            products with the changes that the maps showed; then the same of the changes by temperature alone.
-        stuck: (N,) effective signals at which actuators stand that do not move any more; NaN = it moves.
-        temperatures: (3,) degC, that gain and offset hold at, and the lowest and highest of the maps; NaN = not known.
+        surprising: number of latest maps, in a row, that disagreed.
+        disagreement: largest error (m) shown by these maps, or made in other shapes by the faulty actuators they show.
+        evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and of their products
+            with the measured changes; first row: gain and figure, second row: changes by temperature.
+        stuck: (N,) effective signals at which actuators are stuck; NaN = it moves.
+        temperatures: (3,) degC: reference for gain and offset, lowest and highest of the maps; NaN = not known.
     """
 
     gain: Floats
@@ -85,22 +85,22 @@ class Drift:
 
     @property
     def trust(self) -> float:
-        """The share of gain and offset that maps not used for them have borne out, 0 to 1."""
+        """Share of the estimated gain and offset that maps not used for the estimate have confirmed, 0 to 1."""
         return _share(*self.evidence[0])
 
     @property
     def thermal_trust(self) -> float:
-        """The same of the changes by temperature."""
+        """The same for the changes by temperature."""
         return _share(*self.evidence[1])
 
     def warmer(self, temperature: float) -> float:
-        """K above what gain and offset hold at; 0 where not known."""
+        """Temperature above the reference for gain and offset, K; 0 where not known."""
         above = temperature - float(self.temperatures[0])
         return above if np.isfinite(above) else 0.0
 
     @property
     def temperature_range(self) -> float:
-        """K by which maps were colder or warmer than what gain and offset hold at, at most; 0 where not known."""
+        """Largest difference between maps and the reference for gain and offset, K; 0 where not known."""
         return float(np.nan_to_num(np.abs(self.temperatures - self.temperatures[0]).max()))
 
     def reached(self, effective: Floats) -> Floats:
@@ -121,7 +121,7 @@ class Drift:
         return self.trust * float(self.gain[index]), index
 
     def figures(self) -> dict[str, object]:
-        """For diagnostics, as they are used."""
+        """Figures for diagnostics, as they are used."""
         gain, actuator = self.largest_gain
         return {
             "gain_drift_percent": round(100.0 * gain, 4),
@@ -144,9 +144,9 @@ class Drift:
 
 
 class Displaced(NamedTuple):
-    """An actuator that stands elsewhere: by how much effective signal, and how probable that is.
+    """A displaced actuator: by how much effective signal, and how probable that is.
 
-    Against any other actuator and against a map that is bad all over.
+    The alternatives are any other actuator and a map that is bad everywhere.
     """
 
     more: float
@@ -160,10 +160,10 @@ class Comparison:
     Attributes:
         max_zernike: m, largest difference of a coefficient beyond tilt from the calibration as it is used.
         rms: m rms of the difference in sag, piston and tilt removed.
-        surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
-            all values, and the largest single one over the largest to be expected of so many.
-        displaced: by index, the actuators that the difference comes from, the worst first, where a few of them explain
-            it: one that sticks, say.
+        surprise: difference relative to its expected size, about 1 when all is well: the larger of the rms over all
+            values and the largest single value relative to the largest expected among as many.
+        displaced: by index, the actuators that cause the difference, the worst first, where a few of them explain it,
+            such as one that is stuck.
     """
 
     max_zernike: float
@@ -177,7 +177,7 @@ def surprise_of(innovation: Floats, expected: Floats, factor: tuple[Floats, bool
     """`innovation` (R,) over its `expected` covariance (R, R)."""
     size = len(innovation)
     together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
-    # Median of the largest of so many normal numbers.
+    # Median of the largest absolute value of `size` normal numbers.
     largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
     single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
     return float(max(together, single))

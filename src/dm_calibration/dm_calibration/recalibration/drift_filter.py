@@ -1,19 +1,19 @@
 """Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
 
-In the reduced values of a map (:class:`~dm_calibration.hysteresis.responses.Reduction`) a calibration says ``v = v0 + V
-e`` with the effective signals e. Later it is ``v = v0 + d + c + V diag(e) (1 + g)``: gains have changed by the shares
-g, the figure by d, and by c of creep slower than the calibration's run shows. Where maps tell the temperature, t above
-that of the calibration, ``k t V e + h t`` comes on top: k of all gains and h of the figure do not change. Creep fades,
-gains and figure walk at random, so what is known of them fades with time; each map is one step of the Kalman filter,
-which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
+In the reduced values of a map (:class:`~dm_calibration.hysteresis.responses.Reduction`) a calibration predicts ``v = v0
++ V e`` from the effective signals e. Later it is ``v = v0 + d + c + V diag(e) (1 + g)``: gains have changed by the
+shares g, the figure by d and by creep c slower than the run of the calibration shows. Where maps hold a temperature, t
+above that of the calibration, ``k t V e + h t`` is added, with constants k of all gains and h of the figure. Creep
+fades, and gains and figure are random walks, so what is known of them fades with time. Each map is a step of the Kalman
+filter, which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
 
-An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
-calibration worse. So each map is first a test of what the maps before it made out: the change that they predict,
-against the change that it shows. Only the share of the former that this evidence carries is used (the positive-part
-estimate of a regression through the origin, less one standard error), none of it before a second shape was measured.
-Changes by temperature are tested so by themselves.
+An estimate of drift contains noise, and on a mirror that does not drift it is nothing but noise: used as it is, it
+would make the calibration worse. So each map first tests the estimate from earlier maps: the predicted change is
+compared with the measured one. Only the share of the estimate that this evidence supports is used (the positive-part
+estimate of a regression through the origin, less one standard error), and none of it before a second shape was
+measured. Changes by temperature are tested separately in the same way.
 
-A map that departs further from its prediction than chance allows is a bad map, or the mirror is another one: the caller
+A map that departs further from its prediction than chance allows is a bad map, or the mirror has changed: the caller
 must not take it in.
 """
 
@@ -40,16 +40,16 @@ from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 DAY_S = 86400.0
-#: Least variance of a value that is laid to its map's noise, as a share of what the calibration's maps scatter, and
-#: in m^2, for maps without any noise.
+#: Least variance of a value that is attributed to the noise of its map: as a share of the scatter of the calibration's
+#: maps, and in m^2, for maps without any noise.
 NOISE_SHARE_MIN, NOISE_MIN = 0.1, 1e-24
-#: What evidence counts for after one more map: it is of the last thirty maps or so.
+#: Factor on earlier evidence for each further map: evidence is of the last thirty maps or so.
 EVIDENCE_KEPT = 0.97
-#: An actuator that fails stands further from where it should than this many standard deviations.
+#: An actuator counts as failed beyond this many standard deviations from where it should stand.
 DISPLACED_SIGMAS = 4.0
-GAIN_SIGMA_MAX = 0.05  # gains of actuators that hardly show are not known worse
-#: One given up creeps on as after a move across the range, for so many decades of time: with the allowance that every
-#: bound has (1.4), and a map some ten seconds after it failed, for about two hours.
+GAIN_SIGMA_MAX = 0.05  # largest relative standard deviation of a gain, also of actuators that hardly show
+#: Decades of time for which a stuck actuator creeps on, as after a move across the range: with the factor on every
+#: bound (1.4), and a map some ten seconds after it failed, that covers about two hours.
 STUCK_DECADES = 2.0
 
 
@@ -57,12 +57,12 @@ class _Innovation(NamedTuple):
     """A map against its prediction, in R reduced values.
 
     Attributes:
-        design: (R, N + 3 R + 1) what it shows of gains, figure, what temperature does and creep.
-        predicted, warm, shown: (R,) change that the maps before predict, that they predict of the temperature, and
-            that it shows, m rms.
+        design: (R, N + 3 R + 1) sensitivity of the values to gains, figure, temperature coefficients and creep.
+        predicted, warm, shown: (R,) m rms: change that earlier maps predict, that they predict from temperature, and
+            measured change.
         expected: (R, R) covariance of their difference.
         factor: Cholesky factor of that.
-        zernike_error, sag_error: (K,) and (P,) m, from the calibration as it is used.
+        zernike_error, sag_error: (K,) and (P,) m, departure of the map from the calibration as it is used.
     """
 
     design: Floats
@@ -80,7 +80,7 @@ class DriftFilter:
 
     Args:
         calibration: its maps show how far a map scatters about its prediction.
-        options: how fast a mirror drifts, and how far actuators stand off without a hysteresis model.
+        options: how fast a mirror drifts, and the error of effective signals without a hysteresis model.
 
     Raises:
         ValueError: the maps of a hysteresis model have time stamps that run backwards.
@@ -97,11 +97,11 @@ class DriftFilter:
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
         signal_sigma = options.signal_sigma if hysteresis is None else self._law_sigma(hysteresis)
         self._creep_law = HysteresisModel.linear() if hysteresis is None else hysteresis.law
-        # What effective signals that err by 1 each, whichever way, make of the values.
+        # Covariance of the values for independent errors of 1 in all effective signals.
         self._unit = self._gain @ self._gain.T
         self._law = signal_sigma**2 * self._unit
         self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
-        # (N + 3 R + 1, N + 3 R + 1) that one day adds to the covariance of a drift.
+        # (N + 3 R + 1, N + 3 R + 1) growth of the covariance of a drift in one day.
         values = self.reduction.size
         gains = 0.5 * options.gain_rate**2 * (np.eye(fit.actuators) + 1.0)
         figure = options.figure_rate**2 / values * np.eye(values)
@@ -110,7 +110,7 @@ class DriftFilter:
         self._temperature = float(maps.temperature[known].mean()) if known.any() else np.nan
 
     def start(self, stamp_ns: int) -> Drift:
-        """What the calibration itself knows, at its time."""
+        """The drift at the time of the calibration: none, with the uncertainty of the calibration."""
         fit, values = self._fit, self.reduction.size
         shows = fit.response > 0.0
         share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
@@ -129,14 +129,14 @@ class DriftFilter:
         )
 
     def compare(self, drift: Drift, measured: Measurement, effective: Floats, repeat: int = 0) -> Comparison:
-        """Compare a map with what `drift` makes of it; nothing is changed.
+        """Compare a map with what `drift` predicts for it; nothing is changed.
 
         Args:
-            measured: of a time before the drift's, it is taken as of the drift's. The temperature of the first map
-                which tells it stands for that of a calibration which does not.
+            measured: a map older than the drift counts as of the time of the drift. If the calibration has no
+                temperature, the first one measured with a map takes its place.
             effective: (N,) effective signals at its time.
-            repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
-                does not average out, so repeats count for less and less.
+            repeat: number of earlier maps of this very state. The error of the law is the same in all of them and does
+                not average out, so repeats count for less and less.
         """
         drift = self._at(drift, measured.stamp_ns)
         seen = self._innovation(drift, measured, effective, repeat)
@@ -155,7 +155,7 @@ class DriftFilter:
             weighed, warm = cho_solve(factor, seen.predicted), cho_solve(factor, seen.warm)
             rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.predicted
             evidence[0] *= EVIDENCE_KEPT
-            evidence[1] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map that is not warmer says nothing of it
+            evidence[1] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map not warmer is no evidence
             evidence += (weighed @ seen.predicted, weighed @ rest[0]), (warm @ seen.warm, warm @ rest[1])
         known = np.append(drift.temperatures, measured.temperature)
         updated = replace(
@@ -187,12 +187,12 @@ class DriftFilter:
     def give_up(
         self, drift: Drift, actuators: list[int], measured: Measurement, effective: Floats, repeat: int = 0
     ) -> Drift:
-        """`drift` of a mirror on which `actuators` have no effect any more and stand where a map shows them.
+        """`drift` with `actuators` given up: they have no effect any more and stand where a map shows them.
 
         Args as of :meth:`compare`.
 
         Raises:
-            MapNotUsableError: one stands where it should, as far as the map shows.
+            MapNotUsableError: an actuator is where it should be, within the error of the map.
         """
         seen = self._innovation(self._at(drift, measured.stamp_ns), measured, effective, repeat)
         away, sigma = displacement(seen.shown - seen.predicted - seen.warm, self._gain, seen.factor, actuators)
@@ -208,7 +208,7 @@ class DriftFilter:
         return replace(drift, stuck=stuck)
 
     def _at(self, drift: Drift, stamp_ns: int) -> Drift:
-        """`drift` as expected at `stamp_ns`, still with its own stamp: creep fades, and all is known less well."""
+        """`drift` as expected at `stamp_ns`, with its own stamp kept: creep fades, and the covariance grows."""
         elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns))
         grown, most = (slow_creep(self._creep_law, time) for time in (elapsed, np.inf))
         kept = float(np.sqrt(1.0 - (grown / most) ** 2)) if most else 1.0
@@ -220,7 +220,7 @@ class DriftFilter:
         return replace(drift, crept=kept * drift.crept, covariance=covariance)
 
     def _innovation(self, drift: Drift, measured: Measurement, effective: Floats, repeat: int) -> _Innovation:
-        """`drift`: at the time of the map."""
+        """Compare a map with its prediction; `drift` must be the one expected at its time."""
         temperature = measured.temperature
         moved = self._gain * np.where(np.isnan(drift.stuck), effective, 0.0)
         figure, warmer = np.eye(self.reduction.size), drift.warmer(temperature)
@@ -233,21 +233,21 @@ class DriftFilter:
         predicted, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
         used = drift.trust * predicted + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
-        # What the calibration itself does not know of its influence function, beyond gains.
+        # Uncertainty of the calibration's influence function that is not one of gains.
         leverage = effective @ self._fit.signal_covariance @ effective
         expected = design @ drift.covariance @ design.T + (1.0 + repeat) ** 2 * self._law
         creeping = 0.5 * self._gain * self._creeping_on(drift)
         expected += (1.0 + leverage) * np.diag(self._noise) + creeping @ creeping.T
-        if np.isnan(temperature):  # what it has been seen to do may have happened
+        if np.isnan(temperature):  # any change within the temperatures of earlier maps is possible
             unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
             expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
         factor = cho_factor(expected)
         return _Innovation(design, predicted, warm, shown, expected, factor, zernike_error, sag_error)
 
     def warm_error(self, drift: Drift, temperature: float) -> float:
-        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known, or changes none.
+        """95 % bound of the coefficient error by an unknown `temperature` (degC), m; 0 if known or without effect.
 
-        One that is not known is taken to be within the range of those of the maps.
+        An unknown temperature is taken to be within the range of those of the maps.
         """
         if np.isfinite(temperature):
             return 0.0
@@ -256,17 +256,17 @@ class DriftFilter:
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
 
     def stuck_error(self, drift: Drift) -> float:
-        """Bound of what actuators given up change of a coefficient since they creep on, m; 0 without a law of that."""
+        """Bound of the coefficient error by stuck actuators that creep on, m; 0 without a law of creep."""
         return float((np.abs(self._fit.influence_zernike[PISTON_TILT:]) @ self._creeping_on(drift)).max())
 
     def _creeping_on(self, drift: Drift) -> Floats:
-        """(N,) bound of the effective signal by which actuators given up creep on, 0 of the others."""
+        """(N,) bound of the creep of stuck actuators since then, in effective signal; 0 for the others."""
         return STUCK_DECADES * self._creep_law.creep_rate * np.nan_to_num(1.0 + np.abs(drift.stuck))
 
     def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:
-        """The influence function with gains and figure as far as what `drift` has found of them is borne out.
+        """The influence function with gains and figure changed by the confirmed part of `drift`.
 
-        Actuators that do not move have none: what they do where they stand is part of the figure.
+        Stuck actuators have no influence: their constant effect is part of the figure.
         """
         fit, moves = self._fit, np.isnan(drift.stuck)
         warmer = drift.thermal_trust * drift.warmer(temperature)

@@ -35,12 +35,12 @@ from dm_common.values import wholes, without_figures
 REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
-#: Maps of which messages are still to come, and maps remembered so that none counts twice.
+#: Most maps kept that still lack a message, and maps remembered so that none counts twice.
 INCOMPLETE_KEPT, MAPS_KEPT = 8, 64
 
 
 class MapListener:
-    """Gives maps that arrive to :class:`RecalibrationManager` and publishes what they change.
+    """Passes arriving maps to :class:`RecalibrationManager` and publishes what they change.
 
     Args:
         busy: whether a calibration is running; its maps are not taken.
@@ -57,10 +57,10 @@ class MapListener:
         self._node, self._values = node, values
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
-        self.history = AppliedHistory()  # what stood at the mirror, which the node forgets with it
+        self.history = AppliedHistory()  # signals applied to this mirror; the node clears it for another mirror
         self._followed: Any = None  # law and mid range
-        self._turn = threading.Lock()  # one map at a time; held over measuring and judging
-        self._exchange = threading.Lock()  # a map is compared by the law that its effective signals are of
+        self._turn = threading.Lock()  # one map at a time; held while measuring and judging
+        self._exchange = threading.Lock()  # a map is compared under the law of its effective signals
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
         self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
@@ -81,7 +81,7 @@ class MapListener:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, calibration: Calibration | None) -> None:
-        """Keep `calibration` true from now on, and follow its hysteresis about the mid range of the mirror as it is."""
+        """Keep `calibration` true from now on, and follow its hysteresis about the present mid range of the mirror."""
         same = calibration is getattr(self._updates.in_use, "calibration", None)
         middle = float(mirror.rest[0]) if (mirror := self._manager.mirror) is not None else 0.0
         law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
@@ -95,20 +95,20 @@ class MapListener:
             self._updates.folder = self._manager.store.folder
             try:
                 remark = self._updates.begin(calibration)
-            except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
+            except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, without updates
                 remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
         if remark:
             self._node.get_logger().warning(remark)
 
     def amend(self, message: CalibrationMsg) -> None:
-        """Put what maps have shown since into the message of the calibration in use."""
+        """Add what later maps have shown to the message of the calibration in use."""
         self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
         if (kept := self._updates.in_use) is not None:
             put_updates(message, kept, self._temperatures.published(), self._doubts(), self._updates.mirror_changed)
 
     @property
     def recipes_in_doubt(self) -> bool:
-        """Whether the mirror goes on without some actuators, or maps disagree: recipes are of what it was."""
+        """Whether recipes may not hold any more: some actuators are given up, or maps disagree."""
         kept = self._updates.in_use
         return kept is not None and bool(kept.drift.given_up or kept.drift.surprising)
 
@@ -124,7 +124,7 @@ class MapListener:
 
     @property
     def _age_s(self) -> float:
-        """Since a map last agreed with the calibration, or since it was made, s."""
+        """Time since a map last agreed with the calibration, or since it was made, s."""
         if (kept := self._updates.in_use) is None:
             return 0.0
         now = int(self._node.get_clock().now().nanoseconds)
@@ -246,10 +246,10 @@ class MapListener:
                 purpose = "a map is compared with the calibration (service update_calibration)"
                 try:
                     stack.enter_context(self._services.held(request, purpose))
-                except Refusal as refusal:  # a map of a mirror that somebody moves is not usable, and shows nothing
+                except Refusal as refusal:  # go on with a dry run: a map of a moving mirror is not usable anyway
                     if not (request.dry_run and refusal.error_code == ErrorCode.BUSY):
                         raise
-                # A map of a mirror that does not rest before and after is refused: corrections of creep wait so long.
+                # A map is refused unless the mirror rests before and after it; corrections of creep wait that long.
                 becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
                 try:

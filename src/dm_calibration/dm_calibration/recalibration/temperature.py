@@ -1,4 +1,4 @@
-"""The topic `temperature`: what it said when a map was taken, and whether it still comes."""
+"""The topic `temperature`: its reading at the time of a map, and whether readings still arrive."""
 
 import math
 from bisect import bisect_right, insort
@@ -12,9 +12,9 @@ from dm_common.messages import seconds
 
 #: Readings kept: an hour of one a second.
 KEPT = 3600
-#: A change that is worth publishing what depends on it anew, K.
+#: Change of temperature after which everything that depends on it is published again, K.
 WARMED_K = 0.05
-#: What a thermometer may say, degC; anything else is a fault of it.
+#: Range of possible readings, degC; anything else is a fault of the thermometer.
 POSSIBLE = (-100.0, 200.0)
 
 
@@ -23,7 +23,7 @@ class TemperatureLog:
 
     Args:
         node: listens on the topic `temperature`.
-        silent_after: asked each time: s without a reading from which on the temperature is not known.
+        silent_after: returns the time without a reading, s, after which the temperature is not known.
     """
 
     def __init__(self, node: Node, silent_after: Callable[[], float]) -> None:
@@ -38,8 +38,8 @@ class TemperatureLog:
             return
         stamp, latest = seconds(message.header.stamp) or now, now + self._silent_after()
         while self._readings and self._readings[-1][0] > latest:
-            self._readings.pop()  # of before the clock was set back
-        # One that a clock set back or a torn driver has spoilt is none; one that comes late keeps its place.
+            self._readings.pop()  # from before the clock was set back
+        # A reading spoilt by a faulty driver or a clock set back is dropped; a late one is sorted in by its stamp.
         if (possible := POSSIBLE[0] <= message.temperature <= POSSIBLE[1]) and stamp <= latest:
             insort(self._readings, (stamp, message.temperature))
             del self._readings[:-KEPT]
@@ -61,12 +61,12 @@ class TemperatureLog:
         return self.at(1e-9 * self._node.get_clock().now().nanoseconds)
 
     def published(self) -> float:
-        """The same, of something that is published now."""
+        """The temperature now, remembered as the one that was published last."""
         self._published = self.now()
         return self._published
 
     @property
     def changed(self) -> bool:
-        """Whether it differs from what was published last, came back or stays away."""
+        """Whether the temperature differs from the one published last, or has become known or unknown since."""
         now, before = self.now(), self._published
         return not abs(now - before) < WARMED_K and not (math.isnan(now) and math.isnan(before))

@@ -19,7 +19,7 @@ SCHEMA_VERSION = 1
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
-#: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
+#: Figures missing in older files, with the values that give the trust of exactly 1 with which these were used.
 _FIGURES = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0, "disagreement": 0.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
@@ -29,8 +29,8 @@ class UpdatesFileError(ValueError):
 
 
 def _head(calibration: Calibration) -> dict[str, Attribute]:
-    """What ties a file to its calibration: id, and SHA-256 over what updates change, influence function, points,
-    hysteresis. Recipes, notes may be added later.
+    """What ties a file to its calibration: id, and SHA-256 over what updates change (influence function and figure),
+    points and hysteresis. Recipes and notes are left out, since they may be added later.
     """
     columns: dict[str, Column] = {name: getattr(calibration.fit, name) for name in _RESULT}
     columns |= {f"points/{name}": getattr(calibration.fit.points, name) for name in ("x", "y", "weight")}
@@ -43,7 +43,7 @@ def write_updates(path: Path, calibration: Calibration, updates: Drift) -> None:
     """Write `updates` of `calibration`.
 
     Raises:
-        OSError: what stood there before still does.
+        OSError: it could not be written; the file that was there before still is.
     """
     columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, *_OR_NAN)}
     attributes: dict[str, Attribute] = {
@@ -58,7 +58,7 @@ def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | N
     """The updates of `calibration` in a file; None when there is no file.
 
     Args:
-        like: with arrays of the shapes that must be there.
+        like: has arrays of the required shapes, and the values of those that older files lack.
 
     Raises:
         UpdatesFileError: damaged, foreign, or of another calibration.
@@ -82,7 +82,7 @@ def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | N
     if later and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
         size = len(like.covariance) - sum(map(len, later.values()))
         arrays |= later | {"covariance": block_diag(covariance, like.covariance[size:, size:])}
-    # Before these were kept all actuators moved, and nothing was known of the temperature.
+    # Older files lack these: then all actuators moved, and the temperature was not known.
     arrays |= {name: columns.get(name, getattr(like, name)) for name in _OR_NAN}
     for name, value in arrays.items():
         shape, nan = getattr(like, name).shape, name in _OR_NAN

@@ -1,6 +1,6 @@
 """The calibration in use, kept true by maps that arrive later: which are taken, what they change, what is stored.
 
-The calibration's own file is never touched. What later maps have shown stands beside it, in ``<id>.updates.hdf5``.
+The calibration's own file is never changed. What later maps have shown is stored beside it, in ``<id>.updates.hdf5``.
 """
 
 import threading
@@ -27,7 +27,7 @@ from dm_common.measurement import Measurement
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
-#: Moves that are nearer to each other in time are one, s.
+#: Times of moves that differ by less than this belong to the same move, s.
 SAME_MOVE_S = 0.2
 SUFFIX = ".updates.hdf5"
 
@@ -51,8 +51,8 @@ class InUse:
     """The calibration in use and what later maps have shown of it. Never changed in place.
 
     Attributes:
-        repeats: maps that were taken of the present shape, which the mirror has had since `since` (s), the first of
-            them at `first_ns`.
+        repeats: number of maps of the present shape, which the mirror has had since `since` (s); the first of them was
+            taken at `first_ns`.
     """
 
     calibration: Calibration
@@ -99,7 +99,7 @@ class RecalibrationManager:
 
     @property
     def widened(self) -> list[str]:
-        """A sentence where bounds are wider by maps that disagree, but these are too few for a doubt."""
+        """A sentence if disagreeing maps widen the bounds but are too few to doubt the calibration."""
         surprising = 0 if (kept := self.in_use) is None else kept.drift.surprising
         if not 0 < surprising < self._options().surprises_max:
             return []
@@ -131,7 +131,7 @@ class RecalibrationManager:
         """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
 
         Args:
-            without: indices of actuators that do not move any more: from now on without effect, standing where the
+            without: indices of actuators that do not move any more; from now on they have no effect and stand where the
                 map shows them.
 
         Raises:
@@ -196,7 +196,7 @@ class RecalibrationManager:
     def _kept(self) -> InUse:
         if (kept := self.in_use) is None:
             raise MapNotUsableError(NO_CALIBRATION)
-        if kept.filter.options != (options := self._options()):  # parameters that are live
+        if kept.filter.options != (options := self._options()):  # live parameters have changed
             kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, options))
         return kept
 
@@ -205,7 +205,7 @@ class RecalibrationManager:
 
 
 def _repeats(kept: InUse, stamp_ns: int, settled: SettledState) -> int:
-    # Where it is held against creep, the first correction that kept this very shape is not always the same one.
+    # While a shape is held against creep, the correction found to have begun it is not always the same one.
     same = abs(settled.since - kept.since) < SAME_MOVE_S and 1e-9 * (stamp_ns - kept.first_ns) < REPEAT_S
     return kept.repeats if same else 0
 

@@ -28,7 +28,7 @@ class ErrorPrediction:
         self._manager, self._values = manager, values
         self._lock = threading.Lock()
         self._of = ""
-        self._predictor: ErrorPredictor | Refusal | None = None  # why there is none, so as not to find out again
+        self._predictor: ErrorPredictor | Refusal | None = None  # or why there is none, kept for further requests
 
     def fit(self, request: Any, response: Any) -> Any:
         """Serve `fit_regression`.
@@ -75,7 +75,7 @@ class ErrorPrediction:
         if isinstance(predictor, Refusal):
             if predictor.error_code != ErrorCode.TOO_FEW_MAPS:
                 raise Refusal(predictor.error_code, str(predictor))
-            # Of pokes alone, for instance: nothing to warn of, for the controller asks of each calibration.
+            # From pokes alone, for instance: nothing to warn of, since the controller asks about every calibration.
             response.error_code, response.message = predictor.error_code, str(predictor)
             return without_figures(response)
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
@@ -98,7 +98,7 @@ def _selection(p_enter: float, p_remove: float) -> SelectionOptions | None:
     """Thresholds of a request, 0 = default; None when both are. Raises Refusal when they contradict each other."""
     if p_enter == 0.0 and p_remove == 0.0:
         return None
-    # A p_remove that is refused must be named itself, not as the default that follows from it.
+    # If p_remove is invalid, the message must name it, not the p_enter that follows from it.
     enter = p_enter or (min(P_ENTER, p_remove) if p_remove > 0.0 else P_ENTER)
     try:
         return SelectionOptions(enter, p_remove or max(P_REMOVE, enter))

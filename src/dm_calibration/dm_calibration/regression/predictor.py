@@ -1,9 +1,9 @@
 """The surface control error of a command that is still to come, with an interval.
 
-The regression says how the error follows from a command and those before it. Whoever asks about a command gives no
-history, and the error depends on it: so the answer is taken over many histories, as the mirror may have in use: smooth
-shapes (the spheres and Zernike surfaces of the calibration) of any size the range allows, in random order from a rested
-mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
+The regression gives the error of a command from this command and those before it. A request contains no history, but
+the error depends on it, so the answer is taken over many histories that the mirror may have in use: smooth shapes (the
+spheres and Zernike surfaces of the calibration) of any size the range allows, in random order from a rested mirror. The
+interval holds 95 % of them, widened by the uncertainty of the regression.
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,9 @@ class ErrorPredictor:
     Attributes:
         influence: the influence function that nominal surfaces come from.
         fit: the regression, of all surfaces p01-p58.
-        held_out_rms: of these surfaces, see :func:`~dm_calibration.regression.surface_error.regress`, m.
-        sag: from commands, by all good maps.
-        histories: (1 + COMMANDS, HISTORIES, N) normalised; the first is rest, for creep has died away there.
+        held_out_rms: error of these surfaces, see :func:`~dm_calibration.regression.surface_error.regress`, m.
+        sag: model of the sag from commands, fitted to all good maps.
+        histories: (1 + COMMANDS, HISTORIES, N) normalised signals; the first is rest, where creep has died away.
     """
 
     influence: InfluenceFit

@@ -1,11 +1,11 @@
-"""The sag of a command from the signals and those before it, to predict the surface control error of it.
+"""The sag of a command from its signals and those before it, to predict its surface control error.
 
 An influence function fitted to signals errs by hysteresis and creep. Here each actuator follows the effective signal of
-a :class:`~dm_common.hysteresis.model.HysteresisModel` of Prandtl-Ishlinskii form with creep. Few play operators do: a
-hundred maps of sample surfaces turn the actuators far less often than the excitation of a hysteresis plan. Weights and
-creep rate are shared by all actuators; gains are in the influence function. Sag = figure + H e is bilinear, so figure
-and H, then weights and creep rate are least-squares solutions in turn. The figure follows the reference frames
-(:func:`~dm_calibration.influence.regression.drift_columns`).
+a :class:`~dm_common.hysteresis.model.HysteresisModel` of Prandtl-Ishlinskii form with creep. A few play operators
+suffice: a hundred maps of sample surfaces turn the actuators far less often than the excitation of a hysteresis plan.
+Weights and creep rate are shared by all actuators; gains are in the influence function. Sag = figure + H e is bilinear,
+so figure and H, then weights and creep rate are found by alternating least squares. The figure follows the reference
+frames (:func:`~dm_calibration.influence.regression.drift_columns`).
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
 #: Half-widths of the play operators beside the signal itself, normalised.
 PLAY_RADII = (0.05, 0.15, 0.3, 0.5, 0.75)
-#: Rounds of alternating solutions; the weights stand to 1e-3 after four.
+#: Rounds of alternating solutions; the weights have converged to 1e-3 after four.
 ROUNDS = 6
-#: Largest creep rate that is believed, share per decade.
+#: Largest creep rate that is accepted, share per decade.
 CREEP_RATE_MAX = 0.2
 
 
@@ -35,7 +35,7 @@ class SagModel:
     """Sag of the maps of one run, as fitted to some of them.
 
     Attributes:
-        hysteresis: of all actuators; its effective signal begins with weight 1 on the signal.
+        hysteresis: law of all actuators; the weight of the signal itself is 1.
         influence: (N, P) m per unit effective signal.
         figure: (R, P) m, at rest, at the knots of the drift.
     """
@@ -53,13 +53,13 @@ class RunHistory:
 
         Args:
             maps: of the run, in the order measured, which begins at rest, demagnetised (degauss).
-            model: (M, P) m, sag to fill points without data from.
+            model: (M, P) m, sag used to fill points without data.
         """
         self._maps = maps
         self._usable, self._sag = complete_sag(maps, model)
         self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step)
         self._radius = np.array((0.0, *PLAY_RADII))
-        time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
+        time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # even if the clock was set back
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
         responses = Responses(self._sag, 0, self._usable)
         run = Run(maps.applied, time, responses, -BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed, maps.rest)
@@ -71,7 +71,7 @@ class RunHistory:
         keep = keep & self._usable
         area = np.sqrt(self._maps.points.weight)
         figure, sag = self._figure[keep], self._sag[keep] * area
-        free = np.linalg.qr(figure)[0]  # what the figure takes up is no evidence about the weights
+        free = np.linalg.qr(figure)[0]  # what the figure explains is no evidence on the weights
         without_figure = without(sag, free)
         weights, rate = np.eye(len(self._radius))[0], 0.0
         for _ in range(ROUNDS):

@@ -229,7 +229,7 @@ def _remove(columns: Floats, target: Floats, selected: list[int], options: Selec
 def _samples(
     candidates: ArrayLike, response: ArrayLike, weights: ArrayLike | None, left_out: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Candidates, response and weights as arrays, of which a regression can be made, also with some `left_out`."""
+    """Candidates, response and weights as arrays, checked to suffice for a regression with `left_out` samples fewer."""
     x, y = np.asarray(candidates, dtype=float), np.asarray(response, dtype=float)
     if len(y) - left_out < FREEDOM_MIN + 2:
         raise TooFewMapsError(

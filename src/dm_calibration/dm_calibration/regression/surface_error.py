@@ -5,21 +5,21 @@ its rms over the whole aperture. The sample surfaces p01-p58 train the regressio
 
 *Candidates.* [1] has 37 signals and 21 coefficients. The error is a norm, sqrt(|figure + print-through s + what the
 actuators remember|^2): almost no linear function of either, which is why the adjusted R^2 in [1] is 0.2
-(`studies.paper.readings` compares the readings of [1]). Taken are the signals and one candidate more, `model`: the norm
-of the error that follows from the commands so far (:mod:`~dm_calibration.regression.sag_history`), so it knows
-hysteresis and creep, and the figure drifts with the reference frames. Nothing measured on the surface itself enters,
+(`studies.paper.readings` compares the readings of [1]). The candidates here are the signals and one more, `model`:
+the norm of the error predicted from the commands so far (:mod:`~dm_calibration.regression.sag_history`). It contains
+hysteresis and creep, and a figure that drifts with the reference frames. No measurement of the surface itself enters,
 but the frames before and after it do.
 
 `model` is never taken from a fit that has seen the surface: every surface is predicted from a fit without its own fold.
 (G is: it defines the nominal surface, so it is part of the question, not of the answer.)
 
-*Thresholds.* Of C candidates that mean nothing, the best passes 0.05 more often than not. The usual thresholds are
+*Thresholds.* Of C candidates without any effect, the best passes 0.05 more often than not. The usual thresholds are
 divided by C (Bonferroni): with `model` in, a signal that enters by chance makes a poke of its actuator unpredictable.
 
 *AZWreg.* (a) Another G, from coefficients fitted with region weights; (b) the response a region-weighted norm; (c)
 weighted least squares, each surface weighted by Eq. (8) with r the variance of its own ten regional errors; (d) all ten
 regions of all surfaces as samples of one regression. Table 3 gives Err and RelErr, hence the true errors, and they are
-the same for both models to within rounding: that excludes (b). n = 49 in Table 2 excludes (d). Taken is (a) with (c):
+the same for both models to within rounding: that excludes (b). n = 49 in Table 2 excludes (d). Chosen is (a) with (c):
 the influence function carries its method, :func:`surface_weights` gives the weights, and Eq. (8) does what the text
 says, "make a larger value of variability have less impact". epsilon is the median of the r.
 
@@ -96,8 +96,8 @@ def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
 def surface_weights(errors: SurfaceErrors) -> Floats:
     """(S,) weights of the surfaces for AZWreg: Eq. (8) with r the variance of a surface's regional errors, m^2.
 
-    Scaled such that a surface of weight 1 has the average variance: that is what a new one, whose regional errors
-    nobody has measured, counts as.
+    Scaled such that a surface of weight 1 has the average variance: a new surface, whose regional errors have not been
+    measured, counts with that weight.
 
     Raises:
         ValueError: the errors of all surfaces are the same in all regions, so that Eq. (8) gives no weights.
@@ -154,6 +154,6 @@ def held_out_errors(maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, pred
     sag = np.empty((len(errors.rows), len(maps.points)))
     for k in np.unique(fold):
         own = errors.rows[fold == k]
-        # Repeated maps of a state leave together.
+        # Repeated maps of a state are left out together.
         sag[fold == k] = predict(fit.used & ~np.isin(maps.step, maps.step[own]))[own]
     return surface_control_error(sag, errors.signals, fit.influence_zernike, maps.points)
