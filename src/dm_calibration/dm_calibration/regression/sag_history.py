@@ -20,14 +20,12 @@ from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run, without
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import complete_sag, drift_columns
 from dm_common import Floats
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 #: Half-widths of the play operators beside the signal itself, normalised.
 PLAY_RADII = (0.05, 0.15, 0.3, 0.5, 0.75)
 #: Rounds of alternating solutions; the weights have converged to 1e-3 after four.
 ROUNDS = 6
-#: Largest creep rate that is accepted, share per decade.
-CREEP_RATE_MAX = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +58,7 @@ class RunHistory:
         self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step)
         self._radius = np.array((0.0, *PLAY_RADII))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # even if the clock was set back
-        moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
+        moved = np.clip(maps.moved_s(), np.concatenate(([-BEFORE_FIRST_MAP_S], time[:-1])), time)
         responses = Responses(self._sag, 0, self._usable)
         run = Run(maps.applied, time, responses, -BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed, maps.rest)
         self._plays = run.along(lambda signals: play_features(signals, self._radius, 1, maps.rest))
