@@ -26,9 +26,9 @@ from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, from_values, reals
 
-#: What moves are refused with while a controller that died is away, and until it has learnt all that it needs.
+#: Errors of moves while a controller that died is away, and until the new one has received all that it needs.
 _AWAY = (ErrorCode.TIMEOUT, ErrorCode.NODE_INACTIVE, ErrorCode.DRIVER_UNAVAILABLE, ErrorCode.NOT_CALIBRATED)
-#: Uncertainty of a move's curvature with which the mirror stands where it is sent, in depths of focus.
+#: Largest uncertainty of a move's curvature, in depths of focus, for which moves count as accurate.
 TRUSTED = 2.0
 
 
@@ -59,10 +59,10 @@ class AutofocusAction(ProbeAction):
             result.message += "; at the end of the range: the object may lie beyond it"
 
     def _search(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig, str]:
-        """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
+        """Search from beginning to end and stay on the peak; if none is found, return to the previous shape.
 
         Returns:
-            The peak; the search with the range that was possible, which depends on the actuators' history too;
+            The peak; the search with the range that was possible, which depends on the actuators' history as well;
             remarks for the result's message.
         """
         before = self._probe.shape
@@ -104,7 +104,7 @@ class AutofocusAction(ProbeAction):
         return search.current.peak, search.current.config, self._remarks(search)
 
     def _remarks(self, search: FocusSearch) -> str:
-        """What the user should know of how the focus was found, or why it was not."""
+        """Remarks for the user on how the focus was found, or why it was not."""
         swept = f"; the range was swept: {search.reason}" if search.reason else ""
         given = given_focal_length(self._values, self._probe.camera_info)
         where = "(optics.focal_length_px, or fx of camera_info)"
@@ -119,7 +119,7 @@ class AutofocusAction(ProbeAction):
         )
 
     def _model(self, config: SearchConfig, region: Region) -> DefocusModel | str:
-        """How images of the region are blurred, or the reason why that is not known."""
+        """The model of how images of the region are blurred, or the reason why there is none."""
         radius, newest = ready_capabilities(self._probe).aperture_radius, self._probe.newest
         if not self._values["search.few_images"]:
             return "search.few_images is false"
@@ -129,14 +129,14 @@ class AutofocusAction(ProbeAction):
             lens = focus_lens(self._values, radius, self._probe.camera_info)
             image = raw_image(newest)
             pixels = grey(image)
-            # Of a Bayer sensor every second pixel along a side is green.
+            # Of a Bayer pattern, `grey` returns half as many pixels along each side.
             lens = replace(lens, focal_length_px=lens.focal_length_px * pixels.shape[1] / image.width)
             return DefocusModel(cut(pixels, region).shape, lens, config.high - config.low + BEYOND * config.tolerance)
         except ValueError as error:  # no focal length, or too small
             return str(error)
 
     def _doubt(self) -> str:
-        """Why the mirror may not move as it is asked to; "" = it does. Creep of hours is the same in all images."""
+        """Why the mirror may not move accurately; "" = it does. Slow creep does not count: all images share it."""
         answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
         if answer is None or not answer.history_known:
             return "the mirror's hysteresis is not known"
@@ -146,7 +146,7 @@ class AutofocusAction(ProbeAction):
         return f"moves may err by {bound * 1e9:.0f} nm"
 
     def _track(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region, peak: Peak, result: Any) -> None:
-        """Stay on the peak until cancelled or pre-empted: ends by an error only, and not for a controller that died."""
+        """Stay on the peak until an error, cancelling or pre-emption ends it; a controller that died is waited for."""
         tracker = self._tracker(peak, config, region)
         position = peak.curvature
         while True:
@@ -172,7 +172,7 @@ class AutofocusAction(ProbeAction):
                     tracker = self._tracker(peak, config, region)
             except Refusal as error:
                 if error.error_code == ErrorCode.NOT_CONVERGED:
-                    # Nothing to see now: what is seen here from now on is the new normal.
+                    # Nothing to focus on: the present sharpness becomes the new reference.
                     peak = Peak(tracker.centre, sample.sharpness, False)
                     position = math.nan
                     tracker = self._tracker(peak, config, region)
@@ -184,7 +184,7 @@ class AutofocusAction(ProbeAction):
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
 
     def _tracker(self, peak: Peak, config: SearchConfig, region: Region) -> Tracker:
-        """What stays on a peak: by the optics where camera and mirror are known, else by sharpness alone."""
+        """The tracker of a peak: by the optics if camera and mirror are known, else by sharpness alone."""
         trials = from_values(TrackConfig, self._values, "track.")
         model = self._model(config, region)
         if isinstance(model, DefocusModel) and trials.dither > 0 and not self._doubt():
@@ -206,7 +206,7 @@ class AutofocusAction(ProbeAction):
 
 
 def _draw_in(refuse: Callable[[], None], error: Refusal) -> None:
-    """Have the range end before what the mirror refused. Raises Refusal where hardly anything of it is left."""
+    """Shrink the range to exclude what the mirror refused. Raises Refusal if hardly anything of it is left."""
     try:
         refuse()
     except ValueError as reason:

@@ -1,4 +1,4 @@
-"""Node `autofocus`: a camera's images in, focus requests out; focus by object distance and by dioptre."""
+"""Node `autofocus`: turns images of a camera into focus requests; focus by object distance and by dioptre."""
 
 import math
 import sys
@@ -47,7 +47,7 @@ class AutofocusNode(ManagedNode):
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer, qos_profile=qos.SERVICE)
         self._watched: Any = None
-        self._last_seen: tuple[Any, float] = None, 0.0  # by `health`: the newest image, and the steady time [s]
+        self._last_seen: tuple[Any, float] = None, 0.0  # in `health`: the newest image, and since when [s, steady]
         self._image_problem = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._watch, clock=steady, autostart=False)
@@ -105,7 +105,7 @@ class AutofocusNode(ManagedNode):
         return response
 
     def _dioptres(self, capabilities: Capabilities) -> tuple[float, float]:
-        """Range of dioptres; its near end is inf when the focus comes up to the reference point."""
+        """Range of dioptres; its near end is inf if the focus reaches the reference point of object distances."""
         low, high = (self._optics.dioptre_for(c) for c in (capabilities.curvature_min, capabilities.curvature_max))
         return low, math.inf if math.isnan(high) else high
 
@@ -127,7 +127,7 @@ class AutofocusNode(ManagedNode):
         self._state.publish(state)
 
     def _watch(self) -> None:
-        """While idle, a figure of the newest image now and then."""
+        """While idle, publish the sharpness of the newest image."""
         image = self._probe.newest
         if not self.active or self._probe.user or image is None or image is self._watched:
             return

@@ -1,4 +1,4 @@
-"""Parameters of the node `autofocus`, and what is made from their values."""
+"""Parameters of the node `autofocus`, and the settings made from their values."""
 
 import math
 from collections.abc import Mapping
@@ -89,7 +89,7 @@ def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
     """The optics of the camera.
 
     Raises:
-        ValueError: they make no sense, or the region does not lie in the image.
+        ValueError: inconsistent optics, or a region outside the image.
     """
     check_region(values["region"])
     others = {name: values[f"optics.{name}"] for name in ("relay_magnification", "incidence", "pupil_offset")}
@@ -121,7 +121,7 @@ def given_focal_length(values: Mapping[str, Any], camera_info: Any) -> float:
 
 
 def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: Any) -> FocusLens:
-    """What defocus looks like in the camera.
+    """The lens data that determine how defocus looks in the camera.
 
     Args:
         aperture_radius: of the beam on the mirror [m].

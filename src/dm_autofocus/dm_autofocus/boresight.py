@@ -1,14 +1,14 @@
-"""Where a camera's axis meets the mirror, found by its own images: there the picture stands still as the focus changes.
+"""Where a camera's axis meets the mirror, found by its own images: with the vertex held there the picture stands still.
 
 A sphere of the curvature c has the slope c p at the distance p from its vertex, and the image of an infinitely distant
-point lies off by twice the mean slope over the part of the mirror that the camera uses. So a camera that looks beside
-the middle of the calibrated aperture sees its picture move while the focus changes, by the same distance for equal
-changes. Two small tilts, asked for on purpose, show by how much and where to the picture moves for a known tilt: pixel
-pitch, focal length, relay and the camera's roll need not be known. Images are compared in pairs that are blurred
-alike: half a step before and behind the focus.
+point is shifted by twice the mean slope over the part of the mirror that the camera uses. So if a camera looks beside
+the middle of the calibrated aperture, its picture moves while the focus changes, by equal distances for equal changes.
+Two small deliberate tilts show how far, and in which direction, the picture moves for a known tilt: pixel pitch, focal
+length, relay and the camera's roll need not be known. Images are compared in pairs of equal blur: half a step before
+and behind the focus.
 
-Shifts come from the phase of the cross-power spectrum [34]. Only low spatial frequencies count: their phase is that of
-the mean slope, that of higher ones shows aberrations too.
+Shifts are found from the phase of the cross-power spectrum [34]. Only low spatial frequencies are used: their phase is
+that of the mean slope, while that of higher ones is affected by aberrations.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from dm_common import Floats
 
-#: Frequencies that count: from so many cycles over the image, to so many cycles per pixel.
+#: Range of spatial frequencies used: lower limit in cycles over the image, upper limit in cycles per pixel.
 LOWEST, HIGHEST = 1.5, 0.1
-#: Tilt that is asked for, to either side [m at the edge]: an image moves by two widths of its diffraction.
+#: Tilt that is commanded to either side [m at the edge]: it moves the image by two diffraction widths.
 TILT = 2.5e-7
-#: To either side of the focus, in depths of focus: images are still sharp enough.
+#: Defocus to either side of the focus, in depths of focus: images are still sharp enough.
 STEP = 4.0
 #: Shifts by tilts must be this many times their uncertainty, and those by equal tilts may differ by this factor.
 SIGNIFICANT, ANISOTROPY = 5.0, 2.0
-#: Rounds of the fit of a phase that is known modulo a turn.
+#: Iterations of the fit of a phase that is known modulo 2 pi.
 ROUNDS = 4
 
 
@@ -46,7 +46,7 @@ class Boresight:
     drift_sigma: Floats
 
     def offset(self, aperture_radius: float) -> Floats:
-        """(2,) m: how far from the point where the vertex was held the axis meets the mirror."""
+        """(2,) m: vector from the point where the vertex was held to the point where the axis meets the mirror."""
         return np.asarray(np.linalg.solve(self.scale, self.drift) / aperture_radius, dtype=float)
 
 
@@ -76,7 +76,7 @@ def find_boresight(see: Callable[[float, Floats], NDArray], focus: float, step: 
         see: takes an image (H, W) at a curvature [1/m] and a tilt (2,) of the mirror [m].
         focus: where the picture is sharp [1/m].
         step: to either side of it [1/m].
-        pairs: images on either side, in turns.
+        pairs: number of images on either side, taken alternately.
 
     Raises:
         ValueError: the picture does not follow tilt.

@@ -1,4 +1,4 @@
-"""A plain Python face of the camera pipeline: no callbacks, no executors. See docs/camera.md."""
+"""A plain Python interface of the camera pipeline: no callbacks, no executors. See docs/camera.md."""
 
 import math
 import time
@@ -23,7 +23,7 @@ from dm_common.messages import seconds as seconds_of
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.ros import qos
 
-#: After a move, until images count [s].
+#: Wait after a move before images count [s].
 SETTLE_S = 0.05
 
 _OWN: dict[str, Any] = {
@@ -43,7 +43,7 @@ class CameraFocusClient(DeformableMirrorClient):
     }
 
     def focus_range(self) -> GetFocusRange.Response:
-        """Between which object distances the camera can focus."""
+        """Range of object distances at which the camera can focus."""
         return self.call("get_focus_range", GetFocusRange.Request())
 
     def focus_distance(
@@ -69,15 +69,15 @@ class CameraFocusClient(DeformableMirrorClient):
         timeout_s: float = 60.0,
         **claim: Unpack[Claim],
     ) -> Autofocus.Result:
-        """Search the sharpest focus in a region of the image and stand there.
+        """Search the sharpest focus in a region of the image and stay there.
 
         Args:
             region: left, top, width, height as shares 0..1 of the image (`sharpness.region_of` makes them of pixels);
                 empty = as configured.
             curvature_range: search only here [1/m]; (0, 0) = the whole reachable range.
-            on_feedback: called after each image that counted.
+            on_feedback: called after each image that was used.
             timeout_s: longest time the search may take.
-            claim: where somebody holds the mirror.
+            claim: see `Claim`, for a mirror that somebody holds.
         """
         goal = filled(Autofocus.Goal, region=region, **_ends(curvature_range), **claim)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
@@ -91,7 +91,7 @@ class CameraFocusClient(DeformableMirrorClient):
         timeout_s: float = 60.0,
         **claim: Unpack[Claim],
     ) -> None:
-        """Search the sharpest focus in a region as `autofocus`, and stay on it for so many seconds."""
+        """Search the sharpest focus in a region as `autofocus`, then stay on it for `seconds`."""
         if not (isinstance(seconds, float | int) and seconds >= 0):
             raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, f"seconds = {seconds!r}: must be a number, 0 or more")
         goal = filled(Autofocus.Goal, region=region, track=True, **claim)
@@ -121,11 +121,11 @@ class CameraFocusClient(DeformableMirrorClient):
         """Sweep the focus through the scene.
 
         Args:
-            images: of the stack; 0 = as many as the depth of focus asks for.
+            images: their number; 0 = as many as the depth of focus requires.
             curvature_range: sweep only here [1/m]; (0, 0) = the whole reachable range.
             on_feedback: called after each image.
             timeout_s: longest time the stack may take.
-            claim: where somebody holds the mirror.
+            claim: see `Claim`, for a mirror that somebody holds.
 
         Returns:
             The result; an image that is sharp everywhere, (H, W, channels) in the camera's encoding; distances [m],
@@ -152,14 +152,14 @@ class CameraFocusClient(DeformableMirrorClient):
 
         Args:
             region: left, top, width, height as shares 0..1 of the image: an object that stands still.
-            pairs: images on either side of the focus, in turns; 2 at least.
-            image_topic: of the camera, as `autofocus` takes it; with /compressed behind it too.
-            stamp_lead: by how much an exposure begins before its image's stamp [s], as `autofocus` has it.
-            claim: where somebody holds the mirror.
+            pairs: number of images on either side of the focus, taken alternately; 2 at least.
+            image_topic: of the camera, as in `autofocus`; the same with /compressed appended is used as well.
+            stamp_lead: by how much an exposure begins before its image's stamp [s], as in `autofocus`.
+            claim: see `Claim`, for a mirror that somebody holds.
 
         Raises:
-            DeformableMirrorError: an argument cannot be, a search or a move did not succeed, images do not come, cannot
-                be used or do not follow tilt.
+            DeformableMirrorError: an argument is invalid, a search or a move failed, or images do not arrive, cannot be
+                used or do not follow tilt.
         """
         try:
             part = check_region(region)
@@ -193,9 +193,9 @@ class CameraFocusClient(DeformableMirrorClient):
 
         try:
             return find_boresight(see, focus, step, pairs)
-        except ValueError as error:  # of the images too
+        except ValueError as error:  # raised for unusable images as well
             raise DeformableMirrorError(ErrorCode.NOT_CONVERGED, str(error)) from error
-        finally:  # it was tilted on purpose
+        finally:  # remove the deliberate tilt
             self.focus(focus, **claim)
 
 

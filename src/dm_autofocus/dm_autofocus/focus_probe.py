@@ -28,13 +28,13 @@ from dm_common.messages import seconds
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError
 
-#: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
+#: Profile that cameras publish with; depth 1: an image that was not fetched in time is replaced by the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @dataclass(frozen=True)
 class SharpnessSample:
-    """Sharpness of an image, the message it came with, and its region (H, W); of several, the last and all regions."""
+    """Sharpness of an image, its message and region (H, W); of several: the median, the last message, all regions."""
 
     sharpness: float
     image: Image
@@ -57,7 +57,7 @@ def image_message(header: Any, pixels: NDArray, encoding: str, big_endian: bool 
 
 
 class FocusProbe:
-    """Moves by `focus_request` and measures on `image_raw`. What moves or measures waits: call it in a worker thread.
+    """Moves by `focus_request` and measures on `image_raw`. Both block, so they belong in a worker thread.
 
     Args:
         node: hosts the topics.
@@ -65,16 +65,16 @@ class FocusProbe:
             `settle_time`, `stamp_lead`.
 
     Attributes:
-        controller: whether it is there.
-        capabilities: its latest; None before the first.
-        shape: as taken last: curvature [1/m], NaN before; conic constant; terms [m] if `focus_request` asked for it.
+        controller: whether the focus controller is present.
+        capabilities: the latest of the controller; None before the first.
+        shape: the last one taken: curvature [1/m], NaN before; conic constant; terms [m] if `focus_request` gave them.
         user: action that holds the mirror; "" = none does.
-        target: as asked for by `move` last [1/m]; NaN while nobody holds the mirror.
+        target: curvature that `move` requested last [1/m]; NaN while nobody holds the mirror.
         topic: of the images.
-        newest: the latest image as it came; None before the first.
+        newest: the latest image as received; None before the first.
         camera_info: the latest; None before the first.
         answer: of the controller to the latest `move`; None before it.
-        counted, dropped: images since it was held.
+        counted, dropped: number of images used and not used since the mirror was held.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
@@ -84,19 +84,19 @@ class FocusProbe:
         self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
         self.shape: tuple[float, float, Sequence[float]] = (math.nan, 0.0, ())
-        self._asked_for = FocusRequest()  # on that topic, last
+        self._asked_for = FocusRequest()  # the last one on that topic
         self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
         self._driver: ActuatorState | None = None
         self.answer: FocusState | None = None
         self.user = ""
-        self._check: Callable[[], None] = lambda: None  # whether the user is to stop
+        self._check: Callable[[], None] = lambda: None  # raises Refusal if the user is to stop
         self.target = math.nan
-        self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
-        self._other_request: float | None = None  # of another node, while held [1/m]
-        self._degauss_s = 0.0  # of a degauss that the latest move waits for
-        self._measuring, self._apart = False, 0.0  # and the stamps of the latest two images, by so much [s]
+        self._asked: deque[float] = deque(maxlen=8)  # own requests: an answer to one, however late, is no other node's
+        self._other_request: float | None = None  # curvature requested by another node while held [1/m]
+        self._degauss_s = 0.0  # duration of a degauss that the latest move waits for
+        self._measuring, self._apart = False, 0.0  # _apart: time between the stamps of the latest two images [s]
         self._fresh: Image | CompressedImage | None = None
         self._now = lambda: seconds(node.get_clock().now().to_msg())
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
@@ -110,9 +110,9 @@ class FocusProbe:
         node.create_subscription(Capabilities, "capabilities", partial(setattr, self, "capabilities"), qos.LATCHED)
 
     def subscribe(self) -> None:
-        """Take images as `image_transport` says now."""
+        """Subscribe to images by the present value of `image_transport`."""
         compressed = self._values["image_transport"] == "compressed"
-        # Who remaps image_raw remaps what is made of it, as with image_transport.
+        # The name follows a remapping of image_raw, as with image_transport.
         topic = self._node.resolve_topic_name("image_raw") + ("/compressed" if compressed else "")
         if topic == self.topic:
             return
@@ -145,7 +145,7 @@ class FocusProbe:
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
-                answered = message.applied or message.error_code != ErrorCode.OK  # else a degauss runs first
+                answered = message.applied or message.error_code != ErrorCode.OK  # otherwise a degauss runs first
                 self._degauss_s = 0.0 if answered else message.predicted_duration
                 if answered:
                     self.answer = self.answer or message
@@ -169,17 +169,17 @@ class FocusProbe:
     # --- moving and measuring ---
 
     def busy(self) -> Refusal:
-        """Of what would move the mirror while an action of this node holds it."""
+        """The refusal of others that would move the mirror while an action of this node holds it."""
         return Refusal(ErrorCode.BUSY, f"the action {self.user} is running; cancel it first, or take the mirror over")
 
     @contextmanager
     def held(self, asked: Any, action: str, check: Callable[[], None]) -> Iterator[None]:
-        """The mirror is that of one action of this node for the block, and held at the driver.
+        """Hold the mirror for one action of this node during the block, here and at the driver.
 
         Args:
-            asked: its goal, see `MirrorHolder.held`.
+            asked: the goal of the action, see `MirrorHolder.held`.
             action: its name.
-            check: raises Refusal when it is to stop; called while `move` and `measure` wait.
+            check: raises Refusal if the action is to stop; called while `move` and `measure` wait.
 
         Raises:
             Refusal: another action or somebody else has it, or there is no driver.
@@ -198,7 +198,7 @@ class FocusProbe:
         try:
             with self._hold.held(asked, f"action {action}; cancel it to end it", 0.0, self._values["move_timeout"]):
                 yield
-        except ServiceCallError as error:  # of the hold: no action calls a service
+        except ServiceCallError as error:  # from holding the mirror: actions call no service
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
         finally:
             self.target = math.nan
@@ -206,12 +206,12 @@ class FocusProbe:
             self.user = ""
 
     def move(self, curvature: float, conic_constant: float = 0.0, zernike: Sequence[float] = ()) -> None:
-        """Ask for a curvature [1/m], with terms added [m], and wait until its shape stands.
+        """Request a curvature [1/m], with terms added [m], and wait until the move has ended.
 
         Raises:
             Refusal: refused, no answer, another node moves the mirror, the move does not end, or the user is to stop.
         """
-        self._wait(lambda: True, 0.0, self._check)  # who is to stop asks for no other shape
+        self._wait(lambda: True, 0.0, self._check)  # an action that is to stop must not request another shape
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
             self.answer, self._degauss_s = None, 0.0
@@ -277,11 +277,11 @@ class FocusProbe:
         return SharpnessSample(sharpness, image, (part,))
 
     def await_capabilities(self, timeout_s: float, check: Callable[[], None]) -> None:
-        """Wait for the first capabilities, `timeout_s` at most. Raises what `check` does meanwhile."""
+        """Wait for the first capabilities, at most `timeout_s`. Raises what `check` raises meanwhile."""
         self._wait(lambda: self.capabilities is not None, timeout_s, check)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, check: Callable[[], None]) -> bool:
-        """Wait for a condition; False when it was not in time. Raises Refusal as `check`, and on another's move."""
+        """Wait for a condition; False on time-out. Raises Refusal as `check`, or if another node moves the mirror."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while True:
@@ -297,4 +297,4 @@ class FocusProbe:
                     )
                 if time.monotonic() > deadline + self._degauss_s:
                     return False
-                self._changed.wait(0.05)  # `check` gives no notice
+                self._changed.wait(0.05)  # poll: `check` cannot notify

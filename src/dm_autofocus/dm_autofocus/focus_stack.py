@@ -1,8 +1,8 @@
 """A stack of images over focus: an image that is sharp everywhere, and where each part of it is in focus.
 
-Shape from focus [33]: a cell of the image is in focus where its sharpness is largest. Its reciprocal is near to a
-parabola over focus, whose vertex follows from the three images around the largest value. Cells whose sharpness does not
-rise above its noise have no such place. The image shows each cell as it was when it was sharpest.
+Shape from focus [33]: a cell of the image is in focus where its sharpness is largest. The reciprocal of the sharpness
+is nearly a parabola over focus, whose vertex follows from the three images around the largest value. Cells whose
+sharpness does not rise above its noise have no focus. The image shows each cell as it was when it was sharpest.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ NOISE = 0.6
 
 
 class ImageStack:
-    """Images are added one by one; what is kept of each is the sharpness of its cells.
+    """A stack to which images are added one by one; of each, only the sharpness of its cells is kept.
 
     Args:
         cell: side of a cell [px of the grey levels]; its sharpness is the mean over three by three cells.
@@ -41,13 +41,13 @@ class ImageStack:
         Args:
             position: of the focus [1/m]; positions rise by equal steps.
             grey: grey levels, (H, W).
-            pixels: what is shown of them, (kH, kW, ...) with a whole number k.
+            pixels: the pixels to show, (kH, kW, ...) with an integer k.
 
         Raises:
             ValueError: it is of another size than those before.
         """
         if pixels.shape[2:] == (2,):
-            self._cell += self._cell % 2  # of YUV 4:2:2, whose pixels share their colours in twos
+            self._cell += self._cell % 2  # even, since in YUV 4:2:2 two neighbouring pixels share their colours
         sharpness = local_tenengrad(grey, self._cell)
         if not self.positions:
             self._side = self._cell * (len(pixels) // len(grey))
@@ -68,7 +68,7 @@ class ImageStack:
         return cells[rows[:, None], columns]
 
     def in_focus(self, least_contrast: float) -> NDArray[np.float64]:
-        """Where each cell is in focus [1/m]: NaN = nowhere, -inf or inf = beyond the first or the last position.
+        """Curvature at which each cell is in focus [1/m]: NaN = none, -inf or inf = beyond the first or last position.
 
         Args:
             least_contrast: of a cell's sharpness over the stack, relative to its largest, 0..1.

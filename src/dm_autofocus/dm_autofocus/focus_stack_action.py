@@ -1,4 +1,4 @@
-"""The action `focus_stack`: a sweep of the focus, an image that is sharp everywhere, and how far away each pixel is."""
+"""The action `focus_stack`: a sweep of the focus, an image that is sharp everywhere, and the distance of each pixel."""
 
 import copy
 import math
@@ -29,7 +29,7 @@ NEAR, FAR = 5, 95
 
 
 class FocusStackAction(ProbeAction):
-    """Serves `focus_stack`, and publishes what comes of it."""
+    """Serves `focus_stack`, and publishes its results."""
 
     action_type, name = FocusStack, "focus_stack"
     fields = Fields(ASKED | {"images": whole(0, 0, MOST)})
@@ -41,7 +41,7 @@ class FocusStackAction(ProbeAction):
         self._info = node.create_publisher(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
 
     def _plan(self, goal: Any) -> NDArray[np.float64]:
-        """Curvatures of the images, rising: so that hysteresis that is not known is on one branch."""
+        """Curvatures of the images, in rising order, so that unknown hysteresis stays on one branch."""
         capabilities = ready_capabilities(self._probe)
         low, high = range_of(goal, capabilities)
         if 0 < goal.images < FEWEST:
@@ -71,7 +71,7 @@ class FocusStackAction(ProbeAction):
         result.message = f"{len(stack.positions)} images, {100 * result.share:.0f} % of the pixels have a distance"
 
     def _sweep(self, goal_handle: WorkerGoal, plan: NDArray[np.float64]) -> tuple[ImageStack, Image]:
-        """The stack and its last image. What the mirror refuses at the ends of the range is left out."""
+        """The stack and its last image. Curvatures that the mirror refuses at the ends of the range are left out."""
         stack = ImageStack(self._values["stack.cell"])
         image = Image()
         for curvature in plan:
@@ -97,7 +97,7 @@ class FocusStackAction(ProbeAction):
         return stack, image
 
     def _publish_stack(self, last: Image, pixels: NDArray, depth: NDArray[np.float32]) -> None:
-        """The images with the header of the last one, as depth_image_proc takes them."""
+        """Publish the images with the header of the last one, as depth_image_proc requires."""
         self._info.publish(camera_info_for(last, self._probe.camera_info, self._values["optics.focal_length_px"]))
         encoding = "mono8" if last.encoding in PLANAR else last.encoding
         self._image.publish(image_message(last.header, pixels, encoding, last.is_bigendian))
@@ -105,12 +105,12 @@ class FocusStackAction(ProbeAction):
 
 
 def camera_info_for(image: Image, known: CameraInfo | None, focal_length_px: float) -> CameraInfo:
-    """What the camera says of itself, with a projection: from it depths become points.
+    """The CameraInfo of the camera, completed with a projection, by which depths are converted to points.
 
     Args:
-        image: that it is for.
+        image: the image that it belongs to.
         known: what the camera published; None = nothing.
-        focal_length_px: of the image as it comes [px], where the camera tells none; 0 = not known.
+        focal_length_px: focal length of the image as received [px], used if the camera gives none; 0 = not known.
     """
     info = CameraInfo(height=image.height, width=image.width)
     if known is not None and (np.any(known.k) or not focal_length_px > 0):

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the pixels of an encoding lie in memory.
+    """Memory layout of the pixels of an encoding.
 
     Attributes:
-        type: of their numbers.
+        type: NumPy type of the numbers.
         channels: numbers per pixel.
-        channel: the number that is taken.
-        green: of a Bayer pattern, the columns of the green pixels in the even and the odd rows.
+        channel: index of the number that is used.
+        green: for a Bayer pattern, the columns of the green pixels in the even and in the odd rows.
     """
 
     type: str
@@ -26,10 +26,10 @@ class _Layout:
     green: tuple[int, int] | None = None
 
 
-#: Planes: the luminance of all pixels, then the colours, which are not taken.
+#: Planar encodings: first the luminance of all pixels, then the colours, which are not used.
 PLANAR = ("nv21", "nv24")
-#: Of colours the green one is taken: it has most of the luminance, and in a Bayer sensor half of the pixels. Of YUV the
-#: luminance.
+#: Of colours the green one is used: it has most of the luminance, and in a Bayer sensor half of the pixels. Of YUV the
+#: luminance is used.
 ENCODINGS: dict[str, _Layout] = {
     "mono8": _Layout("u1"),
     "8UC1": _Layout("u1"),
@@ -51,14 +51,14 @@ ENCODINGS: dict[str, _Layout] = {
     **{name: _Layout("u1", 2, 0) for name in ("yuyv", "yuv422_yuy2")},
     **{name: _Layout("u1") for name in PLANAR},
 }
-#: Share of the pixels that have the largest value from which on its exposure is called wrong.
+#: Share of pixels with the largest value from which on the exposure counts as faulty.
 CLIPPED = 0.2
-#: By how much a stamp may lie ahead of the time when the image is here [s]: a simulated clock ticks now and then only.
+#: Longest time by which a stamp may be ahead of the clock on arrival [s]: a simulated clock only ticks now and then.
 STAMP_AHEAD = 0.5
 
 
-#: Encodings of the modes that Pillow decodes images to, "I" for 16 bits before its version 10.3; others are turned to
-#: colours.
+#: Encodings by the modes to which Pillow decodes images, "I" for 16 bits before its version 10.3; images of other modes
+#: are converted to RGB.
 MODES = {"L": "mono8", "I;16": "mono16", "I": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
 
 
@@ -67,12 +67,12 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
 
     Args:
         data: the file.
-        image_format: as the message has it; of "bayer_rggb8; jpeg compressed", what stands first.
+        image_format: as in the message; of "bayer_rggb8; jpeg compressed", the first part is used.
 
     Raises:
         ValueError: it is no image that Pillow can read.
     """
-    from PIL import Image  # only who has compressed images pays for it
+    from PIL import Image  # imported here: needed for compressed images only
 
     try:
         with Image.open(io.BytesIO(data)) as image:
@@ -85,14 +85,14 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
     mosaic = image_format.partition(";")[0].strip()
     layout = ENCODINGS.get(mosaic)
     if layout is not None and layout.green is not None and pixels.ndim == 2 and pixels.dtype == np.dtype(layout.type):
-        encoding = mosaic  # what was compressed is the sensor's pattern
+        encoding = mosaic  # the compressed image is the Bayer pattern of the sensor
     return pixels, encoding
 
 
 def pixels_of(message: Any) -> NDArray:
-    """The pixels (height, width, channels) of a `sensor_msgs/Image`, its own numbers in its own order of bytes.
+    """The pixels (height, width, channels) of a `sensor_msgs/Image`, unconverted and in its own byte order.
 
-    Of planes the first.
+    Of a planar image the first plane.
 
     Args:
         message: anything with height, width, encoding, is_bigendian, step (bytes per row) and data.
@@ -117,7 +117,7 @@ def pixels_of(message: Any) -> NDArray:
 
 
 def grey(message: Any) -> NDArray:
-    """Grey levels (height, width) of a `sensor_msgs/Image`: its own numbers, colours by their green channel.
+    """Grey levels (height, width) of a `sensor_msgs/Image`: unscaled, of colours the green channel.
 
     Of a Bayer pattern, (height / 2, width / 2): the sum of the two green pixels of every four, so that the noise of
     neighbours stays independent.
@@ -135,7 +135,7 @@ def grey(message: Any) -> NDArray:
 
 
 def exposure_fault(image: NDArray) -> str:
-    """What is wrong with the exposure of grey levels (H, W): black, or without differences at the top; "" = nothing."""
+    """Fault in the exposure of grey levels (H, W): black, or many pixels at the largest value; "" = none."""
     top = image.max()
     if top <= 0:
         return "the image is black"
@@ -146,7 +146,7 @@ def exposure_fault(image: NDArray) -> str:
 
 
 class SettledGate:
-    """Ties images to a move through their time stamps: those count that were exposed after it had ended and settled.
+    """Decides by time stamps which images were exposed after a move had ended and settled.
 
     All times in s of one clock.
 
@@ -155,7 +155,7 @@ class SettledGate:
         stamp_lead: by how much the exposure began before the image's stamp [s]; 0 = stamps mark its beginning.
 
     Attributes:
-        settled_at: when the shape of the last move stands; inf = not known yet.
+        settled_at: when the shape of the last move has settled; inf = not known yet.
     """
 
     def __init__(self, settle_time: float, stamp_lead: float = 0.0) -> None:
@@ -166,37 +166,37 @@ class SettledGate:
         self.settled_at = math.inf
 
     def sent(self, stamp: float, duration: float = 0.0) -> None:
-        """A command left at `stamp`; its shape is predicted to stand `duration` later."""
+        """Note that a command was sent at `stamp`; its move is predicted to end `duration` later."""
         self._sent_at = stamp
         self._stands_at = stamp + duration
         self.settled_at = math.inf
 
     def written(self, stamp: float, moving: bool, reached: bool) -> None:
-        """The driver reports its last write at `stamp`; `reached`: what stands is what the command asked for.
+        """Note the driver's last write at `stamp`; `reached`: whether the signals written are those of the command.
 
-        A report older than the command counts only when nothing had to move. One that does not show what was asked for
-        may be of before the driver got it: then the shape stands when that was predicted, at the earliest.
+        A report older than the command counts only if nothing had to move. A report of other signals may be from before
+        the driver received the command: then the move ends at the predicted time at the earliest.
         """
         if math.isinf(self.settled_at) and not moving and (stamp >= self._sent_at or reached):
             earliest = self._sent_at if reached else self._stands_at
             self.settled_at = max(stamp, earliest) + self._settle_time
 
     def open_for(self, stamp: float, now: float = math.inf) -> bool:
-        """Whether an image with this stamp, that has come by now, was exposed after the shape stood."""
+        """Whether an image with this stamp, which has arrived at `now`, was exposed after the shape had settled."""
         return stamp - self._stamp_lead >= self.settled_at and stamp <= now + STAMP_AHEAD
 
     def reason(self, newest: float | None, apart: float, timeout_s: float, now: float = math.inf) -> str:
-        """Why no image has counted for a time.
+        """Why no image has counted within a time.
 
         Args:
             newest: stamp of the latest image that came meanwhile; None = none did.
-            apart: from the one before it [s]; 0 = not known.
-            timeout_s: how long one was waited for.
-            now: the time here.
+            apart: time between it and the one before [s]; 0 = not known.
+            timeout_s: how long was waited for an image.
+            now: present time.
         """
         if newest is not None and newest > now + STAMP_AHEAD:
             return f"the newest is stamped {newest - now:.3f} s ahead of the time here; do the clocks agree?"
-        if 2 * apart > timeout_s:  # a period may pass until an exposure begins, and another until it has arrived
+        if 2 * apart > timeout_s:  # one period may pass until an exposure begins, and another until it has arrived
             return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
         if newest is None:
             return "none came; is the camera running?"

@@ -9,7 +9,7 @@ the mirror is flat. Hence an object is in focus when
 
     1/s = m^2 (2 c k + V),
 
-linear in c. A lens of focal length f whose sensor stands a distance b behind it, at a distance d behind the mirror,
+linear in c. A lens of focal length f with the sensor a distance b behind it, at a distance d behind the mirror,
 focuses on the vergence -N with N = 1/f - 1/b at itself, and on V = N / (1 - d N) at the mirror (the vergence v becomes
 v / (1 - d v) over the path d).
 
@@ -162,7 +162,7 @@ def rest_dioptre_of_lens(focal_length: float, sensor_distance: float, mirror_dis
 
     Args:
         focal_length: of the lens, f [m], above 0.
-        sensor_distance: from lens to sensor, b [m], above 0; equal to f = the lens stands at infinity.
+        sensor_distance: from lens to sensor, b [m], above 0; equal to f = the lens is focused at infinity.
         mirror_distance: from mirror to lens, d [m], 0 or more.
 
     Raises:
@@ -184,7 +184,7 @@ def rest_dioptre_of_lens(focal_length: float, sensor_distance: float, mirror_dis
 
 
 def depth_of_focus(aperture_radius: float, wavelength: float = 550e-9) -> float:
-    """Curvature [1/m] off the best focus at which the wavefront is a quarter wave off at the edge: lambda / (4 a^2).
+    """Curvature error [1/m] at which the wavefront is a quarter wave off at the edge: lambda / (4 a^2).
 
     The wavefront of the curvature error e is e r^2 (twice the sag e r^2 / 2); Rayleigh's criterion ([2],
     section 9.3) sets it to lambda / 4 at the edge a of the aperture.

@@ -1,4 +1,4 @@
-"""What the actions of the node have in common: they move the focus and take images until they are done or stopped."""
+"""Base class of the node's actions: they move the focus and take images until they are done or stopped."""
 
 import time
 from abc import ABC, abstractmethod
@@ -19,10 +19,10 @@ from dm_common.values import Fields, real, text, without_figures
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
 
-#: What fields may be that every goal has.
+#: Allowed values of the fields that every goal has.
 ASKED = {"curvature_min": real(0.0), "curvature_max": real(0.0), "holder": text("")}
 
-#: How long a goal waits for a controller that may be starting still, s.
+#: How long a goal waits for a controller that may still be starting, s.
 START_GRACE_S = 5.0
 
 
@@ -61,17 +61,17 @@ def range_of(goal: Any, capabilities: Capabilities) -> tuple[float, float]:
 
 
 class ProbeAction(ABC):
-    """An action that uses the probe, served in worker threads; its newest goal pre-empts.
+    """An action that uses the probe, served in worker threads; a new goal pre-empts the running one.
 
     Args:
         node: hosts the action.
         probe: moves and measures.
         values: parameters of the node.
-        optics: from curvatures to distances, now.
+        optics: returns the present optics, which convert curvatures to distances.
         publish: (phase, sample): publishes an image that counted.
     """
 
-    #: Of the action, and what the fields of its goal may be.
+    #: Type and name of the action, and the allowed values of the fields of its goal.
     action_type: Any
     name: str
     fields: Fields
@@ -95,16 +95,16 @@ class ProbeAction(ABC):
 
     @abstractmethod
     def _plan(self, goal: Any) -> Any:
-        """What is to be done. Raises Refusal."""
+        """Make the plan of a goal. Raises Refusal."""
 
     @abstractmethod
     def _carry_out(self, goal_handle: WorkerGoal, plan: Any, result: Any) -> None:
-        """Do it and fill the result, its message too. Raises Refusal, or ValueError for images that cannot be used."""
+        """Carry out the plan and fill the result with its message. Raises Refusal; ValueError for unusable images."""
 
     def _admit(self, goal: Any) -> None:
-        """Raise Refusal of a goal that cannot be, before it ends the one that runs."""
+        """Raise Refusal for a goal that cannot be carried out, before it pre-empts the running one."""
         if self._probe.capabilities is None:
-            return  # they are waited for
+            return  # `_run` waits for them
         try:
             self._plan(goal)
         except EXPECTED as error:

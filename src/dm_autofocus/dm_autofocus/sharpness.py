@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Region = tuple[float, float, float, float]
 WHOLE: Region = (0.0, 0.0, 1.0, 1.0)
 
-#: Pixels that enter one figure at most; of larger regions only every n-th row counts.
+#: Most pixels that enter one figure; of larger regions only every n-th row is used.
 PIXEL_BUDGET = 400_000
 #: Smallest region [px along a side] that has a gradient.
 SMALLEST = 3
@@ -42,7 +42,7 @@ def check_region(region: Sequence[float]) -> Region:
 
 
 def region_of(roi: Any, width: int, height: int) -> Region:
-    """The region of a `sensor_msgs/RegionOfInterest` in an image of so many pixels; all zeros = the whole image.
+    """The region of a `sensor_msgs/RegionOfInterest` in an image of this size in pixels; all zeros = the whole image.
 
     Raises:
         ValueError: it is not inside the image.
@@ -55,7 +55,7 @@ def region_of(roi: Any, width: int, height: int) -> Region:
             f"x_offset, y_offset, width, height = {roi.x_offset}, {roi.y_offset}, {roi.width}, {roi.height}: must lie "
             f"in an image of {width} x {height} px"
         )
-    # Of a share that was rounded down, `cut` would take the pixel before it.
+    # If a share were rounded down, `cut` would begin one pixel earlier.
     left, top = math.nextafter(roi.x_offset / width, 1), math.nextafter(roi.y_offset / height, 1)
     return left, top, roi.width / width, roi.height / height
 
@@ -124,7 +124,7 @@ def _rows(image: NDArray, pixel_budget: int) -> tuple[NDArray, NDArray, NDArray]
 
 
 def _finite(image: NDArray) -> NDArray[np.float32]:
-    """As float32, what is not a finite number as black; by a power of two below 1, lest squares overflow."""
+    """As float32, non-finite numbers as black; floats scaled by a power of two to below 1, lest squares overflow."""
     values = image.astype(np.float32)
     if image.dtype.kind != "f":
         return values

@@ -1,4 +1,4 @@
-"""Change values in a parameter file and leave all else as it is: comments, order, spelling."""
+"""Change values in a parameter file and leave everything else unchanged: comments, order, spelling."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -13,18 +13,18 @@ Changes = Mapping[str, Mapping[str, Any]]
 def edited(text: str, changes: Changes, namespace: str = "") -> str:
     """The parameter file `text` with the values of `changes`, {node: {parameter: value}}.
 
-    A value stands where it stood; new parameters come first in their section, a new section last in the file, both in
-    the order of `changes`. In a file with sections of several mirrors they are those of the mirror in `namespace`.
+    Values are replaced where they are; new parameters come first in their section, a new section last in the file, both
+    in the order of `changes`. In a file with sections of several mirrors, those of the mirror in `namespace` change.
 
     Raises:
-        ConfigError: the text has a form that cannot be changed so, or a later section overrules a change. Nothing is
+        ConfigError: the text has a form that cannot be preserved, or a later section overrules a change. Nothing is
             lost by an edit.
     """
     expected, namespace = _sections(text), namespace.strip("/")
     for node, values in changes.items():
         key = _key(expected, node, namespace)
         expected[key] = expected.get(key, {}) | dict(values)
-        for name, value in reversed(list(values.items())):  # each new one goes before those that are there
+        for name, value in reversed(list(values.items())):  # each new one is inserted before the existing ones
             text = _with_value(text, key, name, value)
     if _sections(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
@@ -35,9 +35,9 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
 
 
 def _key(keys: Collection[str], node: str, namespace: str) -> str:
-    """The section for what concerns one mirror: its own, also a new one where it names namespaces, else of all."""
+    """The section to change: if the file names namespaces, that of the mirror, new if necessary; else the node's."""
     of_node = [key for key in keys if node_of(key) == node and belongs(key, namespace)]
-    if namespace and any({*key.split("/")[:-1]} - {"", "*", EVERY} for key in keys):  # others may read what is of all
+    if namespace and any({*key.split("/")[:-1]} - {"", "*", EVERY} for key in keys):  # other mirrors read common ones
         own = f"/{namespace}/{node}"
         return next((key for key in of_node if f"/{key.strip('/')}" == own), own)
     return ([key for key in of_node if "*" not in key] or of_node[-1:] or [f"/**/{node}"])[0]
@@ -50,7 +50,7 @@ def _with_value(text: str, key: str, name: str, value: Any) -> str:
     for parameter, old in section.value:
         if parameter.value == name:
             start, end = old.start_mark, old.end_mark.index
-            if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # an item on each line: so it stays
+            if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # keep one item per line
                 end = old.value[-1].end_mark.index
                 literal = f"\n{' ' * start.column}".join(f"- {_literal(item)}" for item in value)
             return text[: start.index] + literal + text[end:]
@@ -62,7 +62,7 @@ def _with_value(text: str, key: str, name: str, value: Any) -> str:
 
 
 def _section(text: str, key: str) -> Any:
-    """The YAML node of the parameters of the section `key`; None where there is none."""
+    """The YAML node of the parameters in the section `key`; None if there is none."""
     top = yaml.compose(text, yaml.SafeLoader)
     for title, content in top.value if top is not None else ():
         if title.value == key:
@@ -71,7 +71,7 @@ def _section(text: str, key: str) -> Any:
 
 
 def values_of(text: str) -> dict[str, dict[str, Any]]:
-    """The values of a parameter file by nodes. Raises ConfigError."""
+    """The values of a parameter file by node. Raises ConfigError."""
     return {node_of(key): values for key, values in _sections(text).items()}
 
 
@@ -84,7 +84,7 @@ def _sections(text: str) -> dict[str, dict[str, Any]]:
 
 
 def _literal(value: Any) -> str:
-    """`value` on one line of YAML; texts that ROS would take for numbers in quotes."""
+    """`value` on one line of YAML; texts that ROS would read as numbers are quoted."""
     for style in (None, '"'):
         text = yaml.safe_dump(value, default_flow_style=True, default_style=style, width=10**6)
         if read_yaml(text) == value:

@@ -1,6 +1,6 @@
-"""The nodes of the suite: the one list that launch files, `./dm`, reference pages, security and recordings go by.
+"""The nodes of the suite: the one list used by launch files, `./dm`, reference pages, security and recordings.
 
-Standard library only, for `./dm` takes the environment of the nodes from here before it has one.
+Standard library only, since `./dm` takes the environment of the nodes from here before it has one.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -16,12 +16,12 @@ class SuiteNode:
 
     Attributes:
         name: of the node and of its executable; `some_name` is the class `SomeNameNode` in `<package>.some_name_node`.
-        package: that holds it.
+        package: that contains it.
         parameter_module: of the package; its `PARAMETERS` is the table of the node's parameters.
-        configuring: "module:function" of the package that the node makes its parts with from the values of all its
-            parameters, or checks them by, raising ValueError; "" = any values that the table allows will do.
+        configuring: "module:function" of the package that makes the node's parts from the values of all its parameters,
+            or checks these, raising ValueError; "" = all values that the table allows are valid.
         lifecycle: whether it is a lifecycle node.
-        optional: whether it runs only where a configuration has a section for it.
+        optional: whether it runs only if a configuration has a section for it.
     """
 
     name: str
@@ -33,7 +33,7 @@ class SuiteNode:
 
     @property
     def module(self) -> str:
-        """What `python -m` starts."""
+        """Name of the module to start with `python -m`."""
         return f"{self.package}.{self.name}_node"
 
     def load_class(self) -> Any:
@@ -46,11 +46,11 @@ class SuiteNode:
         return table
 
     def load_configuring(self) -> Callable[[Mapping[str, Any]], Any] | None:
-        """The function of `configuring`; None where there is none."""
+        """The function of `configuring`; None if there is none."""
         return resolve_name(f"{self.package}.{self.configuring}") if self.configuring else None
 
 
-#: In the order of their start. They stop together, the bench after the others: it outlives the driver's last ramp.
+#: In the order of their start. They stop together, except for the bench, which must outlive the driver's last ramp.
 NODES = (
     SuiteNode("virtual_bench", "dm_simulation", "parameters", "parameters:check_bench", lifecycle=False, optional=True),
     SuiteNode("pdm_driver", "dm_driver", "driver_parameters", "driver_configuration:build_configuration"),
@@ -60,28 +60,28 @@ NODES = (
     SuiteNode("autofocus", "dm_autofocus", "autofocus_parameters", "autofocus_parameters:focus_optics", optional=True),
 )
 NAMES = tuple(node.name for node in NODES)
-#: `python -m` by the name of the node.
+#: Modules for `python -m` by the name of the node.
 MODULES = {node.name: node.module for node in NODES}
 
 
 def nodes_of(configured: Collection[str]) -> tuple[SuiteNode, ...]:
-    """The nodes that run with a configuration which has sections for `configured`."""
+    """The nodes that run with a configuration that has sections for `configured`."""
     return tuple(node for node in NODES if node.name in configured or not node.optional)
 
 
 def node_environment(config_folder: Path) -> dict[str, str]:
-    """Environment variables of every process, unless the user sets them, by the folder `config` of this package."""
+    """Environment variables of every process, unless the user sets them; `config_folder`: `config` of this package."""
     return {
         "FASTRTPS_DEFAULT_PROFILES_FILE": str(config_folder / "fastdds.xml"),
-        # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.
+        # Matrix products here take a millisecond; threads of several nodes would compete for the cores for longer.
         "OPENBLAS_NUM_THREADS": "1",
     }
 
 
-#: What launch puts before the command of a node: signals wait until the node can end in order (`run_node` lets them
-#: in), instead of ending in tracebacks of what it imports.
+#: Prefix of the command of a node in a launch file: signals wait until the node can end in order (`run_node` unblocks
+#: them), instead of ending in tracebacks of the modules that it imports.
 HELD_SIGNALS = "env --block-signal=INT --block-signal=TERM"
-#: From a frame with x ahead and z up to an optical one, with z ahead and x to the right (REP 103), as in `place`.
+#: From a frame with x forward and z up to an optical one, z forward and x to the right (REP 103), as in `place`.
 OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"
 #: Value of the launch argument `autostart`: nodes are configured and activated from outside.
 BY_EVENTS = "events"
@@ -113,7 +113,7 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         values: of LAUNCH_ARGUMENTS, as text.
 
     Raises:
-        ValueError: a value that cannot be; the message names the argument, the value and what is allowed.
+        ValueError: an invalid value; the message names the argument, the value and what is allowed.
     """
     switches = {}
     if values["use_sim_time"]:
@@ -131,7 +131,7 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
 
 
 def namespace_of(values: Mapping[str, str], pushed: str) -> str:
-    """The namespace of the nodes, without slashes around it; an absolute one of `values` leaves what is `pushed`."""
+    """The namespace of the nodes, without slashes around it; an absolute one in `values` replaces what is `pushed`."""
     own = values["namespace"]
     return own.strip("/") if own.startswith("/") else f"{pushed.strip('/')}/{own.strip('/')}".strip("/")
 
@@ -139,13 +139,13 @@ def namespace_of(values: Mapping[str, str], pushed: str) -> str:
 def companions_of(
     values: Mapping[str, str], aggregation: Path, camera: bool = False, pushed: str = ""
 ) -> list[dict[str, Any]]:
-    """Keyword arguments of the launch actions that start what others offer beside the suite.
+    """Keyword arguments of the launch actions that start programs of other packages beside the suite.
 
     Args:
         values: of LAUNCH_ARGUMENTS, as text.
         aggregation: parameter file of the aggregator.
-        camera: whether the simulation has one.
-        pushed: namespace that all of this is launched in.
+        camera: whether the simulation has a camera.
+        pushed: namespace in which all of this is launched.
 
     Raises:
         ValueError: as `arguments_of`.
@@ -183,7 +183,7 @@ def remapping(rule: str) -> tuple[str, str]:
 
 
 def number(name: str, text: Any) -> float:
-    """Raises ValueError for what is none."""
+    """`text` as a number. Raises ValueError if it is not one; `name` is for the message."""
     try:
         return float(text)
     except (TypeError, ValueError):
@@ -191,7 +191,7 @@ def number(name: str, text: Any) -> float:
 
 
 def flag(name: str, text: str, other: str = "") -> bool:
-    """Raises ValueError for what is neither true nor false; the sentence names the `other` value there may be."""
+    """`text` as true or false. Raises ValueError if it is neither; the message also names the allowed value `other`."""
     if text.lower() not in ("true", "false"):
         raise ValueError(f"{name} = {text!r}: must be true{f', {other}' if other else ''} or false")
     return text.lower() == "true"

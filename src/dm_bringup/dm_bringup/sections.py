@@ -1,4 +1,4 @@
-"""The sections of a ROS 2 parameter file: how they are read, and which of them count for a node in a namespace."""
+"""The sections of a ROS 2 parameter file: how they are read, and which of them apply to a node in a namespace."""
 
 import re
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-#: In a parameter file: any number of namespaces, as the last part of a key every node below.
+#: Wildcard in the keys of a parameter file: any number of namespaces; as the last part of a key, every node below.
 EVERY = "**"
 
 
@@ -15,7 +15,7 @@ class ConfigError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 7e-3 for a number, as ROS does, and refuses a key that comes twice, of which YAML keeps the last."""
+    """Reads 7e-3 as a number, as ROS does, and refuses duplicate keys, of which YAML keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value]
@@ -30,7 +30,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(text: str) -> Any:
-    """What a parameter file holds. Raises yaml.YAMLError."""
+    """The content of a parameter file. Raises yaml.YAMLError."""
     loader = _Loader(text)
     try:
         return loader.get_single_data()
@@ -39,20 +39,20 @@ def read_yaml(text: str) -> Any:
 
 
 def node_of(key: str) -> str:
-    """The node that the section `key` of a parameter file is for, in whatever namespace; EVERY = each."""
+    """The node to which the section `key` of a parameter file applies, in whatever namespace; EVERY = all nodes."""
     return key.rpartition("/")[2]
 
 
 def belongs(key: str, namespace: str) -> bool:
-    """Whether the section `key` of a parameter file is for nodes in `namespace` ("" = any), with wildcards as in ROS.
+    """Whether the section `key` of a parameter file applies in `namespace` ("" = any), with wildcards as in ROS.
 
-    `pdm_driver` and `/pdm_driver` are for any namespace here; to ROS they are for none but the root.
+    `pdm_driver` and `/pdm_driver` apply in any namespace here; in ROS they apply in the root namespace only.
     """
     return not namespace or re.fullmatch(_pattern(key), f"/{namespace}") is not None
 
 
 def _pattern(key: str) -> str:
-    """Of the namespaces that a section is for, a regular expression."""
+    """Regular expression of the namespaces in which a section applies."""
     wild = {EVERY: "(/[^/]+)*", "*": "/[^/]+"}
     return "".join(wild.get(step) or re.escape(f"/{step}") for step in _steps(key))
 
@@ -63,17 +63,17 @@ def _steps(key: str) -> list[str]:
 
 
 def _covers(general: str, key: str) -> bool:
-    """Whether the section `general` is for all nodes that `key` is for."""
+    """Whether the section `general` applies to all nodes to which `key` applies."""
     names = [node_of(each) for each in (general, key)]
     inside = "".join(f"/{step}" for step in _steps(key))
     return names[0] in (EVERY, names[1]) and re.fullmatch(_pattern(general), inside) is not None
 
 
 def values_in(sections: Mapping[str, Mapping[str, Any]], node: str, namespace: str) -> dict[str, Any]:
-    """The values of a node in `namespace` ("" = any) of the sections of a file; of several the last counts, as to ROS.
+    """The values of a node in `namespace` ("" = any) from the sections of a file; the last one counts, as in ROS.
 
     Raises:
-        ConfigError: a section overrules one before it that is for some of its nodes only.
+        ConfigError: a section overrules an earlier one that applies to only some of its nodes.
     """
     found: dict[str, Any] = {}
     given: dict[str, str] = {}  # the section that counts, by parameter

@@ -1,4 +1,4 @@
-"""Start and stop the nodes of the suite as processes, where `ros2 launch` is not at hand."""
+"""Start and stop the nodes of the suite as processes, where `ros2 launch` is not available."""
 
 import contextlib
 import os
@@ -19,20 +19,20 @@ from dm_common.ros import SUPERVISOR
 
 Config = dict[str, dict[str, Any]]
 
-#: A node that ended is started again after this time, s; after twice as long each time that it ends soon again, up to
-#: RESTART_MAX_S. One that has run for SETTLED_S begins anew.
+#: Pause before a node that ended is started again, s; it doubles each time that the node soon ends again, up to
+#: RESTART_MAX_S, and is reset once the node has run for SETTLED_S.
 RESTART_S, RESTART_MAX_S, SETTLED_S = 0.5, 30.0, 60.0
-#: Exit status of a node that could not be made: what it was configured with is wrong, see `dm_common.ros.executor`.
+#: Exit status of a node that could not be created because of a wrong configuration, see `dm_common.ros.executor`.
 NOT_MADE = 1
-#: The parameter file that the nodes are started with; a file of the user in the same folder must not be called so.
+#: Name of the parameter file with which the nodes are started; no file of the user in that folder may have this name.
 AS_STARTED = "as_started.yaml"
 
 
 def load_config(path: Path, namespace: str = "") -> Config:
-    """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError when it is none, or cannot be read.
+    """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError if it is not one, or cannot be read.
 
     Args:
-        namespace: of the nodes, without slashes around it; sections of other namespaces do not count. "" = any.
+        namespace: of the nodes, without slashes around it; sections of other namespaces are ignored. "" = any.
     """
     try:
         content = read_yaml(path.read_text())
@@ -56,7 +56,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
         sections[key] = flat(section["ros__parameters"])
         _check_readable(f"{path}: {key}", sections[key])
     named = {node_of(key) for key in sections}
-    if EVERY in named:  # also for nodes that run without a section of their own
+    if EVERY in named:  # applies also to nodes that run without a section of their own
         named = {node.name for node in nodes_of(named)}
     try:
         return {name: values_in(sections, name, namespace) for name in NAMES if name in named}
@@ -65,9 +65,9 @@ def load_config(path: Path, namespace: str = "") -> Config:
 
 
 def _check_readable(section: str, values: Mapping[str, Any]) -> None:
-    """Raise ConfigError of what ROS does not read."""
+    """Raise ConfigError for values that ROS cannot read."""
     for name, value in values.items():
-        if value is None:  # written anew it would be `null`, a text to ROS
+        if value is None:  # would be written as `null`, which is a text to ROS
             raise ConfigError(f"{section}: {name}: must have a value, or be left out")
         kinds = {type(item) for item in value} if isinstance(value, list) else set[type]()
         if len(kinds) > 1:
@@ -76,7 +76,7 @@ def _check_readable(section: str, values: Mapping[str, Any]) -> None:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes every text: ROS takes some for numbers that are none in YAML, such as the serials 0815 and 1e5."""
+    """Quotes every text: ROS reads some as numbers that are texts in YAML, such as the serials 0815 and 1e5."""
 
 
 _Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
@@ -104,7 +104,7 @@ def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: fl
 
 @dataclass
 class _Restarts:
-    """Of one node: when it was started last and is due again, s, steady, and how long the next wait is."""
+    """Restarts of one node: last start and next one due (steady, s), next pause (s), and whether it never ended."""
 
     started: float
     due: float | None = None
@@ -119,11 +119,11 @@ class Suite:
 
     Args:
         config: {node: {parameter: value}}.
-        folder: where the parameter file and the nodes' logs go.
+        folder: for the parameter file and the logs of the nodes.
         domain: ROS domain; None = the environment's.
         namespace: one per mirror.
         echo: True shows the nodes' output on this terminal instead of writing logs.
-        nodes: names of those to start; None = all.
+        nodes: names of the nodes to start; None = all.
         remap: rules `from:=to` for the names of all of them.
     """
 
@@ -165,14 +165,14 @@ class Suite:
         self._restarts.setdefault(name, _Restarts(time.monotonic())).started = time.monotonic()
 
     def _process(self, name: str, arguments: list[str]) -> subprocess.Popen[bytes]:
-        """A node with these command-line arguments, started; it ends by itself when this process is killed."""
+        """Start a node with these command-line arguments; it ends by itself if this process is killed."""
         with contextlib.ExitStack() as stack:
             mode = "ab" if name in self._restarts else "wb"
             output = None if self._echo else stack.enter_context(self.log(name).open(mode))
-            # A node takes signals once it can end in order (`run_node`), not while it still imports.
+            # Signals reach a node once it can end in order (`run_node`), not while it is still importing.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
             stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
-            # Their own process group: Ctrl-C on the terminal is passed on by us, in order, not to all at once.
+            # In a session of their own: Ctrl-C in the terminal reaches them through this process, in order.
             return subprocess.Popen(
                 [sys.executable, "-m", MODULES[name], *arguments],
                 stdout=output,
@@ -182,13 +182,13 @@ class Suite:
             )
 
     def revive(self, say: Callable[[str], None]) -> None:
-        """Start nodes that have ended again, after a pause that grows while they end again; to be called often.
+        """Restart nodes that have ended, after a pause that grows while they end again; to be called often.
 
         Args:
             say: called with a sentence for every node that ended, and for every one that is started again.
 
         Raises:
-            RuntimeError: a node could not be made with this configuration; the next try would end in the same way.
+            RuntimeError: a node could not be created with this configuration; another try would fail in the same way.
         """
         now = time.monotonic()
         for name in self.ended():
@@ -222,7 +222,7 @@ class Suite:
         return [name for name, process in self._processes.items() if process.poll() is not None]
 
     def check(self) -> None:
-        """Raise RuntimeError with the end of its log when a node has ended."""
+        """Raise RuntimeError with the end of the log of a node if one has ended."""
         for name in self.ended():
             self._raise_ended(name)
 

@@ -1,6 +1,6 @@
 """Interferometer map ingest and calibration of deformable mirrors.
 
-`calibrate` makes a calibration of maps, `identify_response` compares laws on any linear measurement.
+`calibrate` makes a calibration from maps; `identify_response` compares hysteresis laws on any linear measurement.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _FROM = {"calibrate": "dm_calibration.calibrator", "identify_response": "dm_cali
 
 
 def __getattr__(name: str) -> Any:
-    # When it is asked for: the process that reads HDF5 files imports this package too, and must stay small.
+    # Imported on first use: the process that reads HDF5 files imports this package too and must stay small.
     if name not in _FROM:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_FROM[name]), name)

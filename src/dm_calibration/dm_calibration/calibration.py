@@ -1,4 +1,4 @@
-"""A calibration: what was measured, the influence function fitted to it, and where it comes from."""
+"""A calibration: what was measured, the influence function fitted to it, and its provenance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -23,11 +23,11 @@ from dm_common.recipes import NO_RECIPES, RecipeBook
 
 SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
-#: What a calibrated mirror promises at least, m, unless the parameter says otherwise: about wavelength / 20.
+#: Default of `calibrated_error_max`: a mirror counts as calibrated if its promise is no larger, m; about wavelength/20.
 CALIBRATED_ERROR_MAX = 32e-9
 
 _POINTS = ("x", "y", "weight")
-#: Names of attributes that differ from their fields'.
+#: Fields whose attribute in the file has another name.
 _STORED_AS = {"limitations": "known_limitations"}
 
 
@@ -39,22 +39,22 @@ class CalibrationFileError(CodedError, ValueError):
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration, complete: raw data, result, provenance. All of it is in the file.
+    """A complete calibration: raw data, result and provenance, all of it stored in one file.
 
     Attributes:
         id: unique name, also the file's stem.
-        wavelength: m; 0 = the maps did not tell.
+        wavelength: m; 0 = not given by the maps.
         aperture_radius: m.
         created_ns: time of writing, ns since the epoch of the node's clock.
-        actuator_x, actuator_y: (N,) m, positions in the configuration at the time of measuring.
-        dropped: "label: reason" of the states that gave no map at all.
-        targets: the shapes that were solved from an influence function; their coefficients are maps.nominal.
-        limitations: sentences; those of the fit, of the run, and of the poke check.
-        hysteresis: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
-        system_error_subtracted: by the instrument itself, from all maps: 1 yes, 0 no, -1 not known.
+        actuator_x, actuator_y: (N,) m, positions as configured at the time of the measurement.
+        dropped: "label: reason" for each state of which no map could be taken.
+        targets: "label: aim" of each shape solved with an influence function; the coefficients are in maps.nominal.
+        limitations: sentences from the fit, the run and the poke check.
+        hysteresis: hysteresis and creep model; if given, `fit` acts on effective signals. None = not identified.
+        system_error_subtracted: whether the instrument itself subtracted its error: 1 yes, 0 no, -1 not known.
         reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
             none.
-        instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.
+        instrument_error: 95 % bound on the instrument error remaining in a coefficient, m; 0 = not known.
         scale_error: 95 % bound on the relative error of lengths on the mirror; 0 = not known.
         region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
     """
@@ -89,16 +89,16 @@ class Calibration:
 
     @property
     def promise(self) -> float:
-        """m, 95 % bound on the largest coefficient error of a request, from maps that had no part in the fit."""
+        """95 % bound on the largest coefficient error of a request, m, from maps that were not used in the fit."""
         found = self.hysteresis
         error = self.fit.held_out_max_zernike if found is None else IN_USE * found.held_out_max_zernike
         return float(error)
 
     def doubts(self, error_max: float = CALIBRATED_ERROR_MAX) -> list[str]:
-        """The reasons why it is approximate only; empty = the mirror is calibrated.
+        """Reasons why the calibration counts as approximate only; empty = the mirror is calibrated.
 
         Args:
-            error_max: m that it must promise.
+            error_max: largest promise that counts as calibrated, m.
         """
         reasons = []
         for grade in NO_RESPONSE:
@@ -111,11 +111,11 @@ class Calibration:
 
     @property
     def maps_dropped(self) -> int:
-        """Maps that did not enter the fit, and states that gave none."""
+        """Number of maps that were excluded from the fit, plus states of which no map could be taken."""
         return int((~self.fit.used).sum()) + len(self.dropped)
 
 
-#: Fields of a calibration that are attributes of its file, and their types there.
+#: Fields of a calibration that are stored as attributes of its file, with their types.
 _ATTRIBUTES: dict[str, type] = {
     name: kind
     for name, hint in get_type_hints(Calibration).items()
@@ -163,7 +163,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     """The calibration in the datasets and attributes of a file.
 
     Raises:
-        CalibrationFileError: another schema, something missing, of a wrong type or shape, or not finite.
+        CalibrationFileError: another schema, or something is missing, of a wrong type or shape, or not finite.
     """
     if attributes.get("schema") != SCHEMA:
         raise CalibrationFileError(f"schema {attributes.get('schema')!r}: not a calibration of this suite")
@@ -173,13 +173,13 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         )
     try:
         points = SamplePoints(*(np.asarray(columns[f"points/{name}"], dtype=np.float64) for name in _POINTS))
-        # Files of before it was kept do not tell when the mirror moved, nor of interruptions and temperature.
+        # Older files lack the time of the last move, the segment of the run and the temperature: not known.
         unknown = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
         before = {"moved_ns": unknown, "segment": unknown, "temperature": np.full(len(unknown), np.nan)}
         columns = {f"maps/{name}": value for name, value in before.items()} | dict(columns)
         raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
-        # Nothing was known of the instrument before it was kept.
+        # Older files hold nothing on the instrument's own error: not known.
         untold: dict[str, Attribute] = {"system_error_subtracted": -1, "reference_surface": ""}
         attributes = untold | {"instrument_error": 0.0, "scale_error": 0.0} | dict(attributes)
         figures = [figure.name for figure in fields(InfluenceFit) if figure.name != "points"]
@@ -217,7 +217,7 @@ def _typed(attributes: Mapping[str, Attribute], name: str, kind: type) -> Attrib
 
 
 def _check_result(calibration: Calibration) -> None:
-    """Shapes and finiteness of everything that a controller will compute with."""
+    """Check shapes and finiteness of everything that a controller will compute with."""
     fit, maps = calibration.fit, calibration.maps
     n, k, p, m = maps.actuators, maps.terms, maps.points.x.size, len(maps)
     shapes = {

@@ -1,4 +1,4 @@
-"""The body of the action `calibrate`: goal to plan, run, fit, store, publish."""
+"""The body of the action `calibrate`: make a plan from the goal, run it, fit, store and publish."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -35,7 +35,7 @@ _PHASES = {
     StepKind.DEGAUSSED: "hysteresis",
 }
 
-#: How long a goal waits for a driver that was started together with this node.
+#: How long a goal waits for a driver that was started together with this node, s.
 START_GRACE_S = 5.0
 
 
@@ -51,7 +51,7 @@ class CalibrateAction:
         driver_facts: Callable[[], Mapping[str, Any]],
         handle: WorkerGoal,
     ) -> None:
-        """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
+        """`driver_facts` gives wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
         self._node, self._values, self._services, self._manager = node, values, services, manager
         self._driver_facts, self._handle, self._goal = driver_facts, handle, handle.request
         self._maps_per_state = self._goal.maps_per_state or 1
@@ -59,7 +59,7 @@ class CalibrateAction:
         self._feedback, self._end = Calibrate.Feedback(), 0
 
     def run(self) -> tuple[str, Calibrate.Result]:
-        """Carry the goal out; returns how it ended, and the result."""
+        """Carry out the goal; return how it ended, and the result."""
         goal, result = self._goal, self._result
         clock = self._node.get_clock()
         started = clock.now()
@@ -80,7 +80,7 @@ class CalibrateAction:
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
         finally:
-            self._services.cancelled = lambda: False  # a goal that has ended ends nobody else's waits
+            self._services.cancelled = lambda: False  # this goal's cancellation must not end waits of other callers
         result.maps_dropped = len(result.dropped)
         result.duration = (clock.now() - started).nanoseconds * 1e-9
         if result.error_code == ErrorCode.OK:
@@ -90,7 +90,7 @@ class CalibrateAction:
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
 
     def _make_plan(self) -> None:
-        """The plan of the goal and what it follows from."""
+        """Make the plan of the goal, and the options that it follows from."""
         goal = self._goal
         if goal.until and goal.plan != PlanKind.HYSTERESIS:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
@@ -107,7 +107,7 @@ class CalibrateAction:
         self._end = 0 if goal.until else len(self._plan.steps)
 
     def _forecast(self) -> None:
-        """Fill in what is to be expected; the message of a dry run."""
+        """Fill in the expected duration and accuracy, and the message of a dry run."""
         goal, plan, result = self._goal, self._plan, self._result
         in_use, taken, guessed = self._manager.in_use, self._services.map_time, self._values["map_time"]
         settle_time = goal.settle_time or self._values["settle_time"]
@@ -121,7 +121,7 @@ class CalibrateAction:
             result.message = f"{time_text}{expected.accuracy(goal.until, drawn)}; nothing was moved"
 
     def _run_kept(self, runs: UnfinishedRuns) -> None:
-        """Begin or resume a run, keep each map as it comes, conclude; fills the result, also after a failure."""
+        """Begin or resume a run, keep each map as it arrives, conclude; fills the result, also after a failure."""
         result, run = self._result, self._opened(runs)
         enough = GoodEnough(
             self._goal.until,
@@ -130,7 +130,7 @@ class CalibrateAction:
         )
         procedure = self._procedure(run, enough)
         try:
-            if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
+            if run.storing is None:  # else everything is measured, and a calibration that may be stored must not change
                 procedure.run()
             self._report("fit", "fit", len(self._plan.steps))
             self._conclude(run, runs, enough)
@@ -140,7 +140,7 @@ class CalibrateAction:
             result.dropped = result.dropped or list(run.outcome.dropped)
         finally:
             run.journal.close()
-            rested = self._services.rest(self._manager.known_mirror().rest)  # as it is now
+            rested = self._services.rest(self._manager.known_mirror().rest)  # the mirror as it is configured now
         kept = ""
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (
@@ -161,7 +161,7 @@ class CalibrateAction:
         age_max, fresh = self._values["resume_max_age"], self._values["start_fresh"]
         now_ns = self._node.get_clock().now().nanoseconds
         run = open_run(runs, identity, plan, age_max, fresh, now_ns, self._maps_per_state, self._goal.note)
-        if fresh:  # for one goal only
+        if fresh:  # applies to one goal only
             self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
         for text in filter(None, (*run.notes, run.resumed)):
             self._node.get_logger().info(text)
@@ -177,7 +177,7 @@ class CalibrateAction:
             self._mirror,
             self._services,
             procedure_options(self._values, self._maps_per_state),
-            # A full plan solves its shapes on the pokes of this very run.
+            # A full plan solves its shapes with the pokes of this run.
             model=in_use.fit if in_use and self._plan.kind is PlanKind.SURFACES else None,
             progress=self._report_progress,
             cancelled=self._services.cancelled,
@@ -188,7 +188,7 @@ class CalibrateAction:
         )
 
     def _guard(self) -> None:
-        """Raise Refusal where the mirror is another one, or its history is lost."""
+        """Raise Refusal if the mirror or its limits changed, or the history of the actuators was lost."""
         now, before = self._manager.mirror, self._mirror
         if now is not None and mirror_facts(now) != mirror_facts(before):
             raise Refusal(
@@ -208,12 +208,12 @@ class CalibrateAction:
 
     def _report_progress(self, now: Progress) -> None:
         self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms
-        # Reference frames, and a degauss in the course of a run, belong to the phase around them.
+        # Reference frames, and a degauss in the course of a run, belong to the phase that surrounds them.
         phase = _PHASES.get(now.kind, self._feedback.phase) if now.done else "degauss"
         self._report(phase, now.label, now.done)
 
     def _report_reached(self, reached: float, maps: int) -> None:
-        """Tell what the run has reached (m) after a part of so many maps, and what is left."""
+        """Report the accuracy reached (m) after `maps` maps, and estimate what is left."""
         feedback = self._feedback
         feedback.reached_max_zernike = reached
         law = left_of_one_map(self._manager.in_use, self._mirror)
@@ -222,7 +222,7 @@ class CalibrateAction:
         self._node.get_logger().info(f"{maps} maps: right to {reached * 1e9:.2f} nm")
 
     def _conclude(self, run: OpenRun, runs: UnfinishedRuns, enough: GoodEnough) -> None:
-        """Fit, check, store and publish what was measured; fills the result. The journal goes when all is on disk."""
+        """Fit, check, store and publish; fills the result. The journal is removed once everything is on disk."""
         goal, mirror, outcome, result = self._goal, self._mirror, run.outcome, self._result
         calibration: Calibration | None = None
         try:
@@ -233,7 +233,7 @@ class CalibrateAction:
                 fit = calibration.fit
             check = check_fit(fit, mirror)
         except ValueError as error:
-            # The next goal would end in the same way; what was measured stays at hand.
+            # The same goal would fail in the same way again; the journal is set aside and its maps are kept.
             run.journal.close()
             raise Refusal(
                 error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"
@@ -255,7 +255,7 @@ class CalibrateAction:
             return
         if (found := calibration.hysteresis) is not None:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = found.name, found.held_out_max_zernike
-        if self._services.cancelled():  # while it was fitted; the same goal fits again what was measured
+        if self._services.cancelled():  # during the fit; the same goal will fit the stored maps again
             raise Cancelled("cancelled")
         self._report("store", calibration.id, len(self._plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
@@ -269,11 +269,11 @@ class CalibrateAction:
         result.message = "; ".join(filter(None, (f"{result.maps} maps, residual {residuals}", reached, warning)))
 
     def _calibration(self, run: OpenRun) -> Calibration:
-        """What the maps of the run give."""
+        """The calibration that follows from the maps of the run."""
         state = self._services.state
         unknown = self._goal.skip_degauss and not (state is not None and state.history_known)
         provenance = self._manager.provenance(self._mirror.name, self._mirror.serial, self._goal.note)
-        if run.storing is not None:  # killed while storing: the same calibration again, not another one
+        if run.storing is not None:  # the process was killed while storing: keep the id, do not make a second one
             provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
         return calibrate(
             run.outcome,

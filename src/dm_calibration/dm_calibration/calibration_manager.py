@@ -1,4 +1,4 @@
-"""The mirror that is connected, the stored calibrations, and the one in use."""
+"""The connected mirror, the stored calibrations, and the calibration in use."""
 
 import threading
 import time
@@ -16,12 +16,12 @@ from dm_common.figures import in_nanometres
 from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError
 
-#: A calibration whose promise is so many times that of the one it replaces is worth a warning.
+#: Factor by which the promise of a calibration may exceed that of the one it replaces without a warning.
 CLEARLY_WORSE = 2.0
 
 
 def becomes(condition: Callable[[], bool], patience: float) -> bool:
-    """Whether `condition` holds, now or within `patience` s of wall time."""
+    """Whether `condition` holds now or becomes true within `patience` s of wall time."""
     deadline = time.monotonic() + patience
     while not (held := condition()) and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -29,10 +29,10 @@ def becomes(condition: Callable[[], bool], patience: float) -> bool:
 
 
 class CalibrationManager:
-    """Shared by the topics, services and the action of the node; every method may be called from any thread.
+    """Shared by the topics, services and the action of the node; every method is thread-safe.
 
     Attributes:
-        mirror: that the driver describes; None before it did.
+        mirror: as the driver describes it; None before it did.
         in_use: the calibration in use; None = there is none.
     """
 
@@ -48,22 +48,22 @@ class CalibrationManager:
 
         Args:
             publish: called with the calibration in use and its file at every change.
-            resting: the reason why no other calibration may be used now; "" = it may.
+            resting: the reason why no other calibration may be put into use now; "" = it may.
         """
         self.store = store
         self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
         self._resting = resting
         self._lock = threading.RLock()
-        # Held while a stored calibration is changed, so that no change gets lost; writing may take long.
+        # Held while a stored calibration is changed, so that no change gets lost; writing may take a while.
         self._changing = threading.Lock()
         self.mirror: Mirror | None = None
         self.in_use: Calibration | None = None
 
     def known_mirror(self, wait_s: float = 0.0) -> Mirror:
-        """The mirror. A worker thread may wait for a driver that is still starting.
+        """The mirror; a worker thread may wait up to `wait_s` for a driver that is still starting.
 
         Raises:
-            Refusal: it is not known yet.
+            Refusal: the mirror is not known yet.
         """
         becomes(lambda: self.mirror is not None, wait_s)
         if (mirror := self.mirror) is None:
@@ -71,7 +71,7 @@ class CalibrationManager:
         return mirror
 
     def set_mirror(self, mirror: Mirror) -> str:
-        """Take over the mirror. Returns why the calibration in use was withdrawn; "" = it was not."""
+        """Set the mirror. Returns why the calibration in use was withdrawn; "" = it was not."""
         with self._lock:
             self.mirror, before = mirror, self.in_use
             if before is None or not (wrong := self.mismatch(before)):
@@ -80,7 +80,7 @@ class CalibrationManager:
             return f"calibration {before.id} withdrawn: {wrong}"
 
     def mismatch(self, calibration: Calibration) -> str:
-        """Why `calibration` does not belong to the mirror; "" = it does, or no mirror is known."""
+        """Why `calibration` does not belong to the mirror; "" = it does, or no mirror is known yet."""
         if (mirror := self.mirror) is None:
             return ""
         of = calibration
@@ -93,10 +93,10 @@ class CalibrationManager:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
 
     def use(self, calibration: Calibration | None) -> str:
-        """Use `calibration`, which is in the store, from now on. Raises Refusal where the node rests by now.
+        """Use `calibration`, which is in the store, from now on. Raises Refusal if the node is inactive by now.
 
-        Returns a warning where it promises clearly less than the one it replaces, or where the next start will not know
-        of it; "" = neither.
+        Returns a warning if it promises clearly less than its predecessor, or if the choice could not be stored for the
+        next start; "" = neither.
         """
         with self._lock:
             before = self.in_use
@@ -117,10 +117,10 @@ class CalibrationManager:
         return "; ".join(warnings)
 
     def _put(self, calibration: Calibration | None) -> None:
-        """Take `calibration` in use; the lock must be held."""
+        """Put `calibration` into use; the lock must be held."""
         self.in_use, file = calibration, None
         if calibration is not None:
-            with suppress(UnknownNameError):  # removed meanwhile; what is in use stays
+            with suppress(UnknownNameError):  # the file was removed meanwhile; the calibration stays in use
                 file = self.store.find(calibration.id)
         self._publish(calibration, file)
 
@@ -131,10 +131,10 @@ class CalibrationManager:
                 self._put(self.in_use)
 
     def load(self, name: str) -> tuple[Calibration, str]:
-        """Load by id or file, or the newest that fits when `name` is empty, and use it. Returns it and what `use` does.
+        """Load by id or file (empty = the newest that fits), and use it. Returns it and the warning of `use`.
 
         Raises:
-            Refusal: no mirror, or the calibration belongs to another; the one in use stays.
+            Refusal: no mirror, or the calibration belongs to another one; the one in use stays.
             UnknownNameError, CalibrationFileError: see the store.
         """
         mirror = self.known_mirror()
@@ -152,13 +152,13 @@ class CalibrationManager:
         return calibration, self.use(calibration)
 
     def load_last(self) -> tuple[Calibration, str]:
-        """Use the calibration that the mirror used last, or the newest that fits where that is not known.
+        """Use the calibration that the mirror used last; if that is not known or fails, the newest that fits.
 
-        Returns it, and why it is not the one used last, as a sentence, or else what `use` does; "" = it is, or none is
-        known.
+        Returns the calibration, and a sentence: why it is not the one used last, else the warning of `use`; "" = no
+        remark.
 
         Raises:
-            Refusal: no mirror, the node rests, or no calibration fits.
+            Refusal: no mirror, the node is inactive, or no calibration fits.
         """
         last, reason = self.store.last_in_use(self.known_mirror().serial), ""
         if last and not self._resting():
@@ -170,7 +170,7 @@ class CalibrationManager:
         return calibration, reason or warning
 
     def named(self, name: str = "") -> Calibration:
-        """A stored calibration by id or file, or where `name` is empty that in use. Raises Refusal if there is none."""
+        """A stored calibration by id or file; empty = the one in use. Raises Refusal if there is none."""
         calibration = self.store.load(name) if name else self.in_use
         if calibration is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
@@ -186,14 +186,14 @@ class CalibrationManager:
         return calibration
 
     def add_recipes(self, calibration_id: str, book: RecipeBook) -> Calibration:
-        """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
+        """Add recipes to the calibration in use, from which they were built; those of the same shape are replaced.
 
-        The calibration is changed in its file as well, and published again.
+        The calibration's file is changed as well, and the calibration is published again.
 
         Raises:
-            Refusal: another calibration is in use, or none; or recipes of a mirror with another number of actuators.
-            RecipeError: no recipes, or made from another condition.
-            StoreError: it could not be written; file and calibration in use are as they were.
+            Refusal: another or no calibration is in use, or the recipes have another number of actuators.
+            RecipeError: no recipes, or recipes made under another condition.
+            StoreError: it could not be written; file and calibration in use are unchanged.
         """
         if not book.recipes:
             raise RecipeError("recipes: must hold at least one")
@@ -211,11 +211,11 @@ class CalibrationManager:
             return after
 
     def keep(self, calibration: Calibration) -> Path:
-        """Store `calibration` and read it back; one that is there already, whole, stays as it is. Returns its file.
+        """Store `calibration` and read it back; a complete one that exists already is left as it is. Returns its file.
 
         Raises:
-            StoreError: it cannot be written, or what is read back is not what was measured.
-            CalibrationFileError: what is read back is damaged.
+            StoreError: it cannot be written, or the maps read back differ from those measured.
+            CalibrationFileError: the file read back is damaged.
         """
         try:
             file = self.store.find(calibration.id)
@@ -226,6 +226,6 @@ class CalibrationManager:
         return file
 
     def provenance(self, name: str, serial: str, note: str) -> Provenance:
-        """A new id and the time for a calibration of mirror `name`, `serial`."""
+        """A new id and the current time for a calibration of mirror `name`, `serial`."""
         now = self._now_ns()
         return Provenance(self.store.new_id(name, serial, now), now, note.replace("\0", ""))

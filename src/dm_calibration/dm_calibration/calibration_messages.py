@@ -1,4 +1,4 @@
-"""Between the messages of dm_msgs and the types of the calibration library."""
+"""Conversion between the messages of dm_msgs and the types of the calibration library."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.messages import doubles, taken, time_message
 
-# Fields of the message that are named as those of a calibration and of its fit.
+# Fields that have the same name in the message and in a calibration or its fit.
 _NAMES = ("id", "mirror_serial", "wavelength", "aperture_radius", "instrument_error", "scale_error")
 _FIGURES = ("actuators", "held_out_rms", "held_out_max_zernike")
 _MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
@@ -31,7 +31,7 @@ _LAW = (
 
 
 def driver_facts(message: MirrorInfo) -> dict[str, Any]:
-    """What maps depend on beside the mirror itself: wiring, electronics and volts, None where these are not known."""
+    """The driver's wiring, electronics and voltages, on which maps depend besides the mirror; None = not known."""
     same = taken(message, "wiring", "electronics", "slew_rate_max")
     volts = {
         name: None if math.isnan(value) else value for name, value in taken(message, "volts_min", "volts_max").items()
@@ -42,7 +42,7 @@ def driver_facts(message: MirrorInfo) -> dict[str, Any]:
 def calibration_message(
     calibration: Calibration | None, file: Path | None, frame_id: str, calibrated_error_max: float
 ) -> CalibrationMsg:
-    """The message on `calibration`; None = no calibration. It is judged by `calibrated_error_max`, m."""
+    """The message on `calibration`; None = no calibration. Its quality is judged by `calibrated_error_max`, m."""
     message = CalibrationMsg()
     message.header.frame_id = frame_id
     if calibration is None:
@@ -72,18 +72,18 @@ def calibration_message(
 def put_updates(
     message: CalibrationMsg, kept: InUse, temperature: float, doubts: list[str], mirror_changed: bool
 ) -> None:
-    """What later maps have shown, into the `message` of the calibration that they update.
+    """Put what later maps have shown into the `message` of the calibration that they update.
 
     Args:
         temperature: degC; NaN = not known.
-        doubts: sentences, added to the known limitations.
+        doubts: sentences that are added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
     """
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
     errors = kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)
-    for promise in (message, message.hysteresis):  # no bound is below what maps have shown since one last agreed
+    for promise in (message, message.hysteresis):  # no bound falls below the disagreement of maps since one last agreed
         promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), *errors)
     message.revision = drift.revision
     message.checked = time_message(drift.checked_ns)
@@ -99,7 +99,7 @@ def _grades(fit: InfluenceFit) -> list[str]:
 
 
 def _slopes(law: HysteresisModel) -> Floats:
-    """As the message has them: of each actuator and way, where the weights are of each actuator."""
+    """Slopes in the layout of the message: per actuator and direction if the weights are per actuator."""
     slope, count = law.duhem_slope, np.size(law.duhem_weight)
     return np.broadcast_to(slope, (count, 2, slope.shape[-1])) if count > 1 and slope.size else slope
 

@@ -43,16 +43,16 @@ from dm_common.values import reals
 
 
 class CalibrationNode(ManagedNode):
-    """Topics, services and the action of the calibration; what they do is in CalibrationManager and CalibrateAction.
+    """Topics, services and the action of calibration; the work is done by CalibrationManager and CalibrateAction.
 
-    While it is inactive it takes no maps, and the calibration in use stays; a cleanup, or another folder, withdraws it.
+    While inactive the node takes no maps and the calibration in use stays; cleanup, or another folder, withdraws it.
     """
 
     def __init__(self) -> None:
         super().__init__("calibration", PARAMETERS, self._on_parameters, hardware_id="calibration")
         self._frame_id = ""
         self._start_pending = False
-        self._loaded_by = ""  # what `load_on_start` was when it was carried out last
+        self._loaded_by = ""  # value of `load_on_start` when it was last carried out
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
         self._recipes = self.create_publisher(RecipeBook, "recipes", qos.LATCHED)
@@ -84,14 +84,14 @@ class CalibrationNode(ManagedNode):
 
     def _on_parameters(self, changes: Mapping[str, Any]) -> None:
         if {"aperture_tolerance", "calibrated_error_max", "updates.surprises_max"} & set(changes):
-            self._manager.publish_again()  # others judge by them
+            self._manager.publish_again()  # receivers judge the calibration by these parameters
 
     def configure(self) -> None:
         if not self._values["calibration_folder"]:
-            raise ValueError("calibration_folder is empty: must name a folder")  # it would be where the node started
+            raise ValueError("calibration_folder is empty: must name a folder")  # "" means the current directory
         folder = Path(self._values["calibration_folder"]).expanduser()
         if folder != self._manager.store.folder:
-            self.clean_up()  # what is in use is not in the new folder
+            self.clean_up()  # the calibration in use is not in the new folder
             self._manager.store.folder = folder
 
     def activate(self) -> None:
@@ -99,7 +99,7 @@ class CalibrationNode(ManagedNode):
         if in_use and wanted == self._loaded_by:
             return
         self._loaded_by, self._start_pending = wanted, bool(wanted)
-        if not (self._start_pending or in_use):  # else nobody shall take for uncalibrated what is about to be loaded
+        if not (self._start_pending or in_use):  # while loading is pending, do not announce "no calibration"
             self._publish(None, None)
         self._load_pending()
 
@@ -108,7 +108,7 @@ class CalibrationNode(ManagedNode):
             self._manager.use(None)
 
     def make_safe(self) -> None:
-        """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
+        """Return the mirror to mid range if the process ends in the middle of a calibration."""
         self._listener.stop()
         mirror = self._manager.mirror
         if self._server.busy and self._bench_services.hold.end() and mirror is not None:
@@ -134,7 +134,7 @@ class CalibrationNode(ManagedNode):
         message.aperture_tolerance = float(self._values["aperture_tolerance"])
         self._listener.begin(calibration)
         self._listener.amend(message)
-        # First, so that nobody takes the calibration for one without.
+        # Recipes first, so that nobody takes the calibration for one without recipes.
         book = calibration.recipes if calibration else NO_RECIPES
         if self._listener.recipes_in_doubt:
             book = replace(book, recipes=())
@@ -154,14 +154,14 @@ class CalibrationNode(ManagedNode):
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         if before is not None and before.limits.middle != mirror.limits.middle:
-            self._manager.publish_again()  # a degauss ends there, and its hysteresis is followed from there
+            self._manager.publish_again()  # a degauss ends at mid range, from where hysteresis is followed
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
         self._load_pending()
 
     def _load_pending(self) -> None:
         if self._start_pending and self.active and self._manager.mirror is not None:
             self._start_pending = False
-            # Reading the folder takes longer than a callback may.
+            # Reading the folder takes too long for a callback.
             threading.Thread(target=self._load_on_start, daemon=True).start()
 
     def _load_on_start(self) -> None:
@@ -173,7 +173,7 @@ class CalibrationNode(ManagedNode):
                 calibration, reason = self._manager.load("" if name == "newest" else name)
             self._log_report(f"calibration {calibration.id} loaded at start{reason and '; '}{reason}", bool(reason))
         except EXPECTED as error:
-            if name in ("last", "newest") and error_code(error) == ErrorCode.NOT_CALIBRATED:  # a bench that is new
+            if name in ("last", "newest") and error_code(error) == ErrorCode.NOT_CALIBRATED:  # normal on a new bench
                 self.get_logger().info(f"{error}: calibrate first")
             else:
                 self.get_logger().warning(f"load_on_start = {name!r}: {error}")

@@ -93,7 +93,7 @@ PARAMETERS = (
     ),
 )
 
-#: What a report judges a calibration by: these parameters of the node, here their defaults.
+#: Parameters of the node by which a report judges a calibration, with their defaults.
 JUDGED_BY = {
     parameter.name: parameter.default
     for parameter in PARAMETERS
@@ -102,7 +102,7 @@ JUDGED_BY = {
 
 
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
-    """Options of a fit from the node's parameters; `method` empty = the default."""
+    """Options of a fit from the node's parameters; an empty `method` selects the default."""
     return from_values(FitOptions, values, method=method or FitOptions().method, epsilon=values["epsilon"] or None)
 
 
@@ -125,6 +125,6 @@ def update_options(values: Mapping[str, Any]) -> UpdateOptions:
         "updates.",
         valid_fraction_min=values["valid_fraction_min"],
         aperture_tolerance=values["aperture_tolerance"],
-        # Without a hysteresis model, an actuator may stand on any branch of its loop.
+        # Without a hysteresis model, an actuator may be on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
     )

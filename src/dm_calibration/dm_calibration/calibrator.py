@@ -1,4 +1,4 @@
-"""From maps, or a stored calibration, to a calibration: fit, poke check, limitations as sentences."""
+"""Make a calibration from maps or from a stored calibration: fit, poke check, limitations as sentences."""
 
 import time
 from collections.abc import Collection
@@ -22,7 +22,7 @@ from dm_calibration.store.calibration_store import new_id
 from dm_common import Floats
 from dm_common.mirror import Mirror
 
-#: What a calibration keeps of the setup of its run.
+#: Fields on the instrument that a calibration takes over from the setup of its run.
 _INSTRUMENT = ("system_error_subtracted", "reference_surface", "instrument_error", "scale_error")
 
 
@@ -74,9 +74,9 @@ def calibrate(
         ``settings`` with the pitch), a list of :class:`~dm_common.measurement.Measurement`, or the
         :class:`~dm_calibration.procedure.outcome.Outcome` of a run, which holds its commands and times.
     commands : array_like (M, N)
-        Normalised signals that stood at the mirror, one row for each map.
+        Normalised signals applied to the mirror, one row for each map.
     times : array_like (M,), optional
-        When the maps were taken, s. As the files say where not given. Hysteresis needs them.
+        When the maps were taken, s; by default as given in the files. Required for hysteresis.
     mirror
         Positions of the actuators, working aperture and limits.
     options
@@ -84,8 +84,8 @@ def calibrate(
     settings
         Pitch, orientation and aperture of the maps; by default the mirror's aperture in the centre of each map.
     hysteresis
-        Whether the commands show hysteresis and creep, beginning from a degauss: some hundred random shapes (see
-        :func:`~dm_calibration.hysteresis.excitation.excitation`). The last fifth of the maps tests the model found.
+        Whether to identify hysteresis and creep. The commands must begin after a degauss: some hundred random shapes
+        (see :func:`~dm_calibration.hysteresis.excitation.excitation`). The last fifth of the maps tests the model.
     provenance
         Id, time and note; by default the mirror's names, now, none.
     run_limitations
@@ -99,14 +99,14 @@ def calibrate(
     Raises
     ------
     MapFileError, MapRejectedError, InsufficientDataError
-        A file or array is no good. With ``hysteresis`` one with too few data is left out, and its command counts.
+        A file or array is unusable. With ``hysteresis`` a map with too few data is left out, but its command counts.
     MeasurementError
         A map cannot be compared with those before it.
     TooFewMapsError
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError
-        Commands or times that do not belong to the maps, commands that are not normalised, or times that are not given,
-        all the same or run backwards where hysteresis is to be identified.
+        Commands or times that do not match the maps, commands that are not normalised, or, where hysteresis is to be
+        identified, times that are missing, all the same or run backwards.
     """
     if isinstance(maps, Outcome):
         outcome = maps
@@ -157,9 +157,9 @@ def calibrate(
 
 
 def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
-    """(10,) weights for commands weighted by region; empty where the maps give none."""
+    """(10,) weights for commands weighted by region; empty if the maps do not determine them."""
     if StepKind.SURFACE in maps.kind:
-        with suppress(ValueError):  # a calibration is whole without them
+        with suppress(ValueError):  # the weights are an optional part of a calibration
             return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
     return np.zeros(0)
 
@@ -167,7 +167,7 @@ def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Flo
 def fit_effective(
     maps: MapSet, hysteresis: HysteresisFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
 ) -> InfluenceFit:
-    """The influence function of `maps`, of effective signals when hysteresis is known; raises as `fit_influence`."""
+    """The influence function of `maps`, on effective signals if hysteresis is known; raises as `fit_influence`."""
     if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
     fit = fit_influence(effective_maps(maps, hysteresis.law), options, rings=mirror.rings, exclude=exclude)
@@ -184,7 +184,7 @@ def refit(
     """A new calibration from the raw data of `stored`, without the maps in `exclude`.
 
     Args:
-        mirror: that it is of, by whose limits errors are told where hysteresis is not followed; None = one without.
+        mirror: its limits give the error to allow for where hysteresis is not followed; None = no limits known.
 
     Raises:
         UnknownNameError: an unknown method or label.

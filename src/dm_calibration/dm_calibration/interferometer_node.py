@@ -1,10 +1,10 @@
-"""Node `interferometer`: reads map files by request, from a watched folder and after a trigger command, and publishes
-map, map info, Zernike coefficients and samples.
+"""Node `interferometer`: reads map files on request, from a watched folder and after a trigger command; publishes map,
+map info, Zernike coefficients and samples.
 
-Stamps are the time of the measurement in ROS time: that of `trigger_exposure` in the trigger command's run; for a file
-from the watched folder its modification time when that is recent, less `file_delay`; for a file named to `ingest_file`
-the time in its header, else its modification time. Where ROS time is a simulator's, or the file's time cannot be right,
-the time of reading takes its place.
+Stamps are the time of the measurement in ROS time. With a trigger command: at the share `trigger_exposure` of its run.
+For a file from the watched folder: its modification time if that is recent, less `file_delay`. For a file named to
+`ingest_file`: the time in its header, else its modification time. Where ROS time is simulated, or the file's time is
+implausible, the time of reading takes its place.
 """
 
 import sys
@@ -43,7 +43,7 @@ from dm_common.values import from_values
 
 
 class InterferometerNode(ManagedNode):
-    """Translates between map files and messages; reading and fitting are in `ingest` and `acquisition`."""
+    """Converts between map files and messages; reading and fitting are in `ingest` and `acquisition`."""
 
     rests = False
 
@@ -55,12 +55,12 @@ class InterferometerNode(ManagedNode):
         self._acquisition: Acquisition | SensorAcquisition | None = None
         self._sensor: Subscription | None = None
         self._map_publishers: tuple[Publisher, ...] = ()
-        self._publishing = threading.Lock()  # the four messages of one map stay together
+        self._publishing = threading.Lock()  # keeps the four messages of one map together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
         self._last_taken: Measurement | None = None
-        self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
-        # There in every state: by its lease others know that this node lives.
+        self._published: dict[str, str] = {}  # path -> sha256 of maps from the watched folder
+        # Exists in every state: by the lease of this topic others know that the node is alive.
         self._info_publisher = self.create_lifecycle_publisher(
             SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE)
         )
@@ -72,7 +72,7 @@ class InterferometerNode(ManagedNode):
         self._mirror_radius = 0.5 * message.full_aperture_diameter
 
     def _fits_mirror(self, changes: Mapping[str, Any]) -> None:
-        """Raise ParameterError for an aperture that is larger than the mirror: a slip of the decimal point."""
+        """Raise ParameterError for an aperture larger than the mirror, such as by a slip of the decimal point."""
         if wrong := too_large(changes.get("aperture.radius", 0.0), self._mirror_radius):
             raise parameters.ParameterError(wrong)
 
@@ -81,7 +81,7 @@ class InterferometerNode(ManagedNode):
         self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
         if topic := self._values["zernike_topic"]:
             self._listen_to(topic)
-        # Latched: what shows the map is opened after it was taken. Who asks for qos.MAP gets later ones only.
+        # Latched: viewers are opened after the map was taken. Subscribers with qos.MAP get later maps only.
         self._map_publishers = (
             self.create_lifecycle_publisher(Image, "surface_map", qos.LATCHED),
             self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE),
@@ -89,7 +89,7 @@ class InterferometerNode(ManagedNode):
         )
 
     def _listen_to(self, topic: str) -> None:
-        """Take measurements from a sensor in place of map files."""
+        """Take measurements from a sensor instead of map files."""
         source = f"topic {self.resolve_topic_name(topic)}"
         self._acquisition = sensor = SensorAcquisition(
             source, lambda seen: read_sensor(seen, self._ingest, self._settings()), self._now_ns
@@ -110,7 +110,7 @@ class InterferometerNode(ManagedNode):
         self.make_safe()
 
     def make_safe(self) -> None:
-        """End the watching thread and a running trigger command."""
+        """Stop the watching thread and a running trigger command."""
         self.active = False
         if self._acquisition is not None:
             self._acquisition.stop()
@@ -150,16 +150,16 @@ class InterferometerNode(ManagedNode):
         return self._accept(response, surface, measured, header, what, publish=not request.answer_only)
 
     def _on_new_file(self, path: Path) -> None:
-        """A new file in the watched folder that nobody waits for; runs in the watching thread."""
+        """Take a new file in the watched folder that no request waits for; runs in the watching thread."""
         try:
             self._take(path)
-        except Exception as error:  # whatever one file does, the next one must be taken
+        except Exception as error:  # no file may keep the next one from being taken
             known = isinstance(error, CodedError)
             self._warn_of_file(str(error) if known else f"{as_text(path)}: {type(error).__name__}: {error}")
 
     def _take(self, path: Path) -> None:
         surface, measured = self._read(path)
-        # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
+        # The digest takes longer than the fit: compute it before publishing only if the file may be unchanged.
         before = self._published.pop(str(path), None)
         known = before is not None and before == surface.sha256
         if self.active and not known:
@@ -202,7 +202,7 @@ class InterferometerNode(ManagedNode):
             if not self._map_publishers:
                 return
             surface_map, zernike, samples = self._map_publishers
-            # What is waited for most comes first; map and digest take longer than all before.
+            # Most urgent messages first; map and digest take longer than all the others.
             zernike.publish(messages.zernike_message(measured, header))
             samples.publish(messages.samples_message(measured, header))
             self._info_publisher.publish(messages.info_message(surface, measured, header))

@@ -1,4 +1,4 @@
-"""Parameters of the node `interferometer`, and what they mean to the library."""
+"""Parameters of the node `interferometer`, and their conversion to settings of the library."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -55,13 +55,13 @@ PARAMETERS = (
 def configure(
     values: Mapping[str, Any], resolve: Callable[[str], str] = lambda topic: f"/{topic.strip('/')}"
 ) -> tuple[AcquisitionSettings, SurfaceMap | None]:
-    """What maps are taken by, and the reference surface; None = there is none.
+    """Settings of map acquisition, and the reference surface; None = there is none.
 
     Args:
-        resolve: full name of a topic of the node; by default of one in no namespace.
+        resolve: gives the full name of a topic of the node; by default without a namespace.
 
     Raises:
-        ValueError: values that contradict each other, or no map to refer to.
+        ValueError: values that contradict each other, or an unusable reference map.
     """
     topic = values["zernike_topic"]
     others = ("watch_folder", "trigger_command", "reference_surface", "retrace", "distortion")

@@ -1,4 +1,4 @@
-"""What the fields of requests and goals to the nodes of this package may be."""
+"""Allowed values of the fields of requests and goals to the nodes of this package."""
 
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_calibration.influence.fit import METHODS
@@ -8,7 +8,7 @@ from dm_common.optics.zernike import TERMS
 from dm_common.values import Fields, real, reals, text, texts, whole
 
 _CONFIGURED = "as configured"
-#: An id or a file of the store.
+#: An id or a file name in the store.
 _CALIBRATION = {"calibration": text("")}
 _METHOD = {"method": text("", choices=("", *METHODS))}
 
@@ -41,7 +41,7 @@ STORE_RECIPES = Fields(
         "recipes.interpolation_error": real(0.0, 0.0, 1.0, "m"),
     }
 )
-#: Of each recipe; how many signals it has is for the calibration to say.
+#: Fields of each recipe; the number of signals is checked against the calibration.
 RECIPE = Fields(
     {
         "curvature": real(0.0),

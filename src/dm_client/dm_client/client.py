@@ -1,4 +1,4 @@
-"""A plain Python face of the suite, for vision stacks and scripts: no callbacks, no executors.
+"""A plain Python interface of the suite, for vision stacks and scripts: no callbacks, no executors.
 
 from dm_client import DeformableMirrorClient
 
@@ -71,11 +71,11 @@ STARTING_S = 60.0
 
 
 class Claim(TypedDict, total=False):
-    """Of every request that moves or holds the mirror, where somebody holds it (service `hold_mirror`).
+    """Options of every request that moves or holds the mirror, if somebody holds it (service `hold_mirror`).
 
     Attributes:
-        holder: who asks; the requests of whoever holds the mirror are carried out.
-        take_over: carry it out even if somebody else holds it: they lose it, and their run ends.
+        holder: who asks; requests of whoever holds the mirror are carried out.
+        take_over: carry it out even if somebody else holds the mirror: they lose it, and their run ends.
     """
 
     holder: str
@@ -83,13 +83,13 @@ class Claim(TypedDict, total=False):
 
 
 class DeformableMirrorClient(Connection):
-    """Talk to one mirror's nodes, from any thread but that which calls `on_feedback`. Use as a context manager.
+    """Client of one mirror's nodes, for any thread except the one that calls `on_feedback`. Use as a context manager.
 
     Args:
-        namespace: of the mirror, "" for none; that of the process it runs in does not count.
+        namespace: of the mirror, "" for none; the namespace of the process itself is ignored.
         domain: ROS domain; None = the environment's.
-        timeout_s: how long to wait for a service that should answer at once. What takes as long as the instrument or
-            the way takes has a limit of its own, none where it is infinite: there the node knows when to give up.
+        timeout_s: longest wait for a service that should answer at once. Measurements and moves have time limits of
+            their own; if such a limit is infinite, the node decides when to give up.
     """
 
     #: The nodes that it calls.
@@ -117,7 +117,7 @@ class DeformableMirrorClient(Connection):
         return self.messages[topic]
 
     def wait_until_active(self, timeout_s: float = 20.0) -> None:
-        """Wait until driver and controller, if there is one, take requests. Raises DeformableMirrorError."""
+        """Wait until the driver, and the controller if there is one, take requests. Raises DeformableMirrorError."""
 
         def refusal() -> tuple[int, str]:
             state, able = self.messages.get("actuator_state"), self.messages.get("capabilities")
@@ -141,7 +141,7 @@ class DeformableMirrorClient(Connection):
 
     @property
     def actuator_state(self) -> ActuatorState:
-        """What stands at the electronics."""
+        """Signals at the electronics, and the state of the driver."""
         return self.latest("actuator_state")
 
     # --- services ---
@@ -170,7 +170,7 @@ class DeformableMirrorClient(Connection):
     def set_signals(
         self, signals: Sequence[float], *, wait: bool = True, **claim: Unpack[Claim]
     ) -> SetSignals.Response:
-        """Set all actuator signals (normalised, -1..+1); with `wait` return when they stand."""
+        """Set all actuator signals (normalised, -1..+1); with `wait`, return once they are reached."""
         request = filled(SetSignals.Request, signals=signals, wait=wait, **claim)
         return self.call("set_signals", request, math.inf if wait else None, again=True)
 
@@ -188,7 +188,7 @@ class DeformableMirrorClient(Connection):
     def measure(self, label: str = "", timeout_s: float = 0.0, *, answer_only: bool = False) -> Measure.Response:
         """Take one map with the interferometer, which gives up after `timeout_s` (0 = as configured) and says why.
 
-        With `answer_only` no other node hears of it, for maps of something else in the mirror's place.
+        With `answer_only` the map is not published: for maps of another object in place of the mirror.
         """
         request = filled(Measure.Request, label=label, timeout=timeout_s, answer_only=answer_only)
         return self.call("measure", request, timeout_s + 5.0 if timeout_s else math.inf)
@@ -198,7 +198,7 @@ class DeformableMirrorClient(Connection):
         return self.call("ingest_file", filled(IngestFile.Request, path=path), timeout_s)
 
     def measure_map(self, label: str = "", timeout_s: float = 0.0) -> tuple[Measure.Response, Image]:
-        """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
+        """Take one map, and return the map itself as well (sensor_msgs/Image, 32FC1, m)."""
         if self.hear("surface_map", Image, qos.MAP):
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
             time.sleep(0.3)  # the publisher must have discovered this subscription too
@@ -224,8 +224,8 @@ class DeformableMirrorClient(Connection):
     ) -> UpdateCalibration.Response:
         """Compare the calibration in use with a map taken now, and let it improve the calibration unless `dry_run`.
 
-        `forget` takes no map but drops all earlier updates. `without` are numbers, from 1, of actuators that do not
-        move any more: from now on they count as without effect, standing where the map shows them.
+        `forget` takes no map but drops all earlier updates. `without` are the numbers, from 1, of actuators that no
+        longer move: from now on they count as without effect, at the position that the map shows.
         """
         request = filled(UpdateCalibration.Request, dry_run=dry_run, forget=forget, without=without, **claim)
         return self.call("update_calibration", request, timeout_s)
@@ -243,7 +243,7 @@ class DeformableMirrorClient(Connection):
         timeout_s: float = math.inf,
         **claim: Unpack[Claim],
     ) -> MoveFocus.Result:
-        """Move to a curvature and return when the shape stands."""
+        """Move to a curvature and return once the shape has settled."""
         request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)
         goal = filled(MoveFocus.Goal, request=request, tolerance=tolerance, settle_time=settle_time)
         return self.run_action("move_focus", goal, on_feedback, timeout_s)

@@ -1,4 +1,4 @@
-"""One node in a thread of its own, for code that calls and waits: the latest messages, services, actions."""
+"""A node in a thread of its own, for code that calls and waits: the latest messages, services, actions."""
 
 import atexit
 import itertools
@@ -22,15 +22,15 @@ from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call, 
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
 
-#: By the name of the node: message type, name and profile of a topic by which it is known to live, and what it serves,
-#: {name: service or action type}.
+#: By the name of a node: message type, name and profile of the topic by which it is known to be alive, and what it
+#: serves, {name: service or action type}.
 Watched = Mapping[str, tuple[Any, str, Any, Mapping[str, Any]]]
-#: Of a node that does not answer; TIMEOUT for the others.
+#: Error code if a node does not answer; TIMEOUT for the other nodes.
 UNAVAILABLE = {
     "pdm_driver": ErrorCode.DRIVER_UNAVAILABLE,
     "interferometer": ErrorCode.INTERFEROMETER_UNAVAILABLE,
 }
-#: What `capabilities` say of a controller or driver that takes no requests, be it that they have not heard better yet.
+#: Error codes in `capabilities` of a controller or driver that takes no requests; these may already be outdated.
 RESTING = (
     ErrorCode.NODE_INACTIVE,
     ErrorCode.DRIVER_INACTIVE,
@@ -38,9 +38,9 @@ RESTING = (
     ErrorCode.ELECTRONICS_UNREACHABLE,
 )
 CLOSED = "the client has been closed"
-#: What a ROS domain may be.
+#: Allowed ROS domains.
 DOMAINS = range(233)
-#: Two connections of one process need two names.
+#: Numbers for the node names of several connections in one process.
 _NUMBERS = itertools.count(1)
 
 
@@ -65,7 +65,7 @@ def checked(response: Any) -> Any:
 
 
 def full_namespace(namespace: str) -> str:
-    """A namespace from the root on; "/" = none. Raises DeformableMirrorError where it cannot be one."""
+    """A namespace as an absolute name; "/" = none. Raises DeformableMirrorError if it is not a valid one."""
     place = f"/{namespace.strip('/')}"
     try:
         validate_namespace(place)
@@ -76,17 +76,17 @@ def full_namespace(namespace: str) -> str:
 
 
 class Connection:
-    """A node that hears topics and calls the nodes of one mirror, once it is started.
+    """A node that receives topics and calls the nodes of one mirror, once it is started.
 
     Args:
-        name: of the node, a number follows.
+        name: of the node; process id and a number are appended.
         namespace: of the mirror, "" for none.
         domain: ROS domain; None = the environment's.
-        topics: {name: (message type, quality of service)}, heard from the beginning.
-        watched: the nodes that it calls. Clients of all that they serve are made at once, so that the nodes have
-            discovered them by the time the first is used.
+        topics: {name: (message type, quality of service)}, subscribed from the beginning.
+        watched: the nodes that it calls. Clients of all their services and actions are made at once, so that discovery
+            is complete by the time the first is used.
         on_message: called with topic and message in the executor's thread, after `messages` has it.
-        timeout_s: how long to wait for an answer that should come at once.
+        timeout_s: longest wait for an answer that should come at once.
 
     Attributes:
         messages: {topic: latest message}.
@@ -111,7 +111,7 @@ class Connection:
             raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, text)
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        # A launched process may be told another name and namespace, which are those of its own node.
+        # The command line of a launched process may set another name and namespace, which are meant for its own node.
         rules = ["--ros-args", "-r", f"__node:={own}", "-r", f"__ns:={place}"]
         self.node = Node(own, namespace=place, context=self._context, cli_args=rules)
         self.messages: dict[str, Any] = {}
@@ -128,14 +128,14 @@ class Connection:
                 self.clients[interface_name] = make(self.node, interface, interface_name)
 
     def start(self) -> None:
-        """Begin to hear; what is added to the node before misses nothing."""
+        """Begin to receive messages; subscriptions made before miss nothing."""
         self._background = BackgroundExecutor(self.node)
-        atexit.register(self.close)  # the interpreter aborts where the thread still runs
+        atexit.register(self.close)  # the interpreter would abort if the thread still ran
 
     def close(self) -> None:
-        """Leave the ROS graph; the mirror keeps its shape. Who still waits for an answer in another thread is told.
+        """Leave the ROS graph; the mirror keeps its shape. Calls that wait for an answer in other threads raise.
 
-        Raises DeformableMirrorError inside a callback, which it would wait for.
+        Raises DeformableMirrorError inside a callback, as it would wait for that callback to end.
         """
         if self._background.is_here:
             raise DeformableMirrorError(ErrorCode.BUSY, "close: not while a callback runs: call it from another thread")
@@ -145,9 +145,9 @@ class Connection:
         self._context.try_shutdown()
 
     def hear(self, topic: str, message_type: Any, profile: Any) -> bool:
-        """Keep the latest message of a topic from now on; False = it is kept already.
+        """Keep the latest message of a topic from now on; False = it is already kept.
 
-        Raises DeformableMirrorError where it cannot be the name of one.
+        Raises DeformableMirrorError if the topic's name is not valid.
         """
         self._check_open()
         if topic in self._heard:
@@ -167,7 +167,7 @@ class Connection:
         return True
 
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
-        """Wait until `condition()` is true; False when it was not in time.
+        """Wait until `condition()` is true; False on time-out.
 
         Raises DeformableMirrorError once the client is closed.
         """
@@ -184,7 +184,7 @@ class Connection:
             raise DeformableMirrorError(ErrorCode.CANCELED, CLOSED)
 
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
-        """The message of a topic that bears a stamp; raise DeformableMirrorError when it does not arrive."""
+        """The message of a topic with the given stamp; raise DeformableMirrorError if it does not arrive."""
         found: Any = None
 
         def arrived() -> bool:
@@ -199,8 +199,8 @@ class Connection:
     def call(self, name: str, request: Any, timeout_s: float | None = None, again: bool = False) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer.
 
-        A node just started may lose a request: with `again`, for one that may be carried out twice, it is sent again
-        once an answer is late that should come at once.
+        A node just started may lose a request: with `again`, for requests that may be carried out twice, it is sent
+        again once an answer that should come at once is late.
         """
         with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
@@ -220,18 +220,18 @@ class Connection:
     ) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
-        Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel it, so that the mirror is left safe;
-        `identity`: see `run_goal`.
+        Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel the goal, so that the mirror is left
+        in a safe state; `identity`: see `run_goal`.
         """
         server, failed = self._servers.get(name), list[Exception]()
 
         def take(feedback: Any) -> None:
             if server is not None:
-                server.heard()  # who speaks lives, even if this process missed that on a busy machine
+                server.heard()  # feedback proves that the node is alive, even if a busy machine missed its lease
             try:
                 if not failed:
                     on_feedback(feedback)
-            except Exception as error:  # in the executor it would end the whole process
+            except Exception as error:  # raised in the executor it would end the whole process
                 failed.append(error)
 
         try:
@@ -253,12 +253,12 @@ class Connection:
 
     @contextmanager
     def _answered(self, name: str) -> Iterator[Callable[[], str]]:
-        """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
+        """Raise DeformableMirrorError if `name` does not answer; yields a function: why its node is gone since now."""
         self._check_open()
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
             raise DeformableMirrorError(ErrorCode.BUSY, text)
-        server = self._servers.get(name)  # None of a client that its user has added
+        server = self._servers.get(name)  # None for a client that the user of this class has added
         if server is not None:
             server.wait_for_return()
         lost = server.since_now() if server is not None else lambda: ""
@@ -269,7 +269,7 @@ class Connection:
         try:
             yield gone
         except Exception as error:
-            if self._closed:  # whatever rclpy says of what is destroyed
+            if self._closed:  # whatever rclpy reports of destroyed objects
                 raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {CLOSED}") from error
             if not isinstance(error, ServiceCallError):
                 raise

@@ -1,4 +1,4 @@
-"""Messages from what Python programs have at hand: NumPy scalars, paths, lists of either."""
+"""Conversion of Python values to fields of messages: NumPy scalars, paths, lists of either."""
 
 import operator
 import os
@@ -17,12 +17,12 @@ def _text(value: Any) -> str:
 
 
 def _flag(value: Any) -> bool:
-    if value not in (0, 1):  # no text, which would be true whatever it says
+    if value not in (0, 1):  # rejects texts, which would always be true
         raise ValueError("neither true nor false")
     return bool(value)
 
 
-#: How a value becomes one of this type; TypeError, ValueError or OverflowError where it cannot.
+#: Conversion of a value to each of these types; raises TypeError, ValueError or OverflowError if it is not possible.
 _CONVERTED: dict[str, Callable[[Any], Any]] = {
     "boolean": _flag,
     "double": float,
@@ -34,7 +34,7 @@ _CONVERTED: dict[str, Callable[[Any], Any]] = {
 def filled(kind: Any, **values: Any) -> Any:
     """A message, request or goal with these fields, converted to their types.
 
-    rclpy ends the whole process at a value of another type: the generated code asserts.
+    rclpy ends the whole process if a value has another type, as the generated code asserts the types.
 
     Raises:
         DeformableMirrorError: INVALID_ARGUMENT or OUT_OF_RANGE, naming the field, its value and what it must be.

@@ -41,9 +41,9 @@ class FilesConfig:
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """Everything the bench is made of. The seed fixes the gains, the initial figure and the noise of the n-th map.
+    """Configuration of all parts of the bench. The seed fixes gains, initial figure and the noise of the n-th map.
 
-    The mirror is the `membrane`, or where there is none the `plate` on `piezo` stacks.
+    The mirror is the `membrane`, or if that is None the `plate` on `piezo` stacks.
     """
 
     seed: int = 1
@@ -63,11 +63,11 @@ class VirtualBench:
     """A running bench.
 
     Args:
-        now: the bench's time in seconds, monotonic but for clock jumps; creep goes by it.
+        now: gives the bench's time in seconds, by which creep runs; monotonic except for clock jumps.
         on_event: called with (severe, text) from the bench's own threads.
 
     Raises:
-        ValueError: a configuration that makes no sense, naming the parameter.
+        ValueError: an inconsistent configuration; the message names the parameter.
         OSError: a port is taken.
     """
 
@@ -101,7 +101,7 @@ class VirtualBench:
         self.monitor = Monitor(config.monitor, neighbour_pairs(self.plate.x, self.plate.y), signals)
         self.maps_written = 0
         self._measuring = threading.Lock()
-        # At once, as on the instrument's PC: whoever watches the folder finds it before the first map.
+        # Created at once, as on the instrument's PC, so that whoever watches the folder finds it before the first map.
         config.files.folder.mkdir(parents=True, exist_ok=True)
         if config.interferometer.instrument_error:
             reference = config.files.folder.absolute() / "reference"
@@ -131,7 +131,7 @@ class VirtualBench:
             self._on_event(True, wrong)
 
     def displacement(self) -> Array:
-        """Base displacements (N,), m, or of a membrane pressures, Pa, now, with all frames that have arrived."""
+        """Base displacements (N,), m (of a membrane: pressures, Pa), at this moment, after all frames that arrived."""
 
         def sample() -> Array:
             self.actuators.advance(self._now())
@@ -140,13 +140,13 @@ class VirtualBench:
         return self.electronics.run(sample)
 
     def temperature(self) -> float:
-        """degC now, of a plate on piezo stacks."""
+        """Present temperature of a plate on piezo stacks, degC."""
         assert isinstance(self.actuators, PiezoActuators)
         self.displacement()
         return self.actuators.temperature
 
     def photograph(self) -> NDArray[np.uint8]:
-        """An image (height, width) of the scene through the mirror as its surface truly is at this moment.
+        """An image (height, width) of the scene through the true surface of the mirror at this moment.
 
         Raises:
             ValueError: the bench has no camera.
@@ -181,7 +181,7 @@ class VirtualBench:
         return path
 
     def _map_file(self, sag: Array, suffix: str, stamp: int) -> bytes:
-        """The file of a map, with its ending and the Unix time of its measurement."""
+        """Content of a map file in the format given by `suffix`; `stamp`: Unix time of the measurement."""
         files, instrument = self.config.files, self.interferometer
         facts = (sag, instrument.pitch, instrument.config.wavelength, stamp)
         if suffix == ".dat":

@@ -1,10 +1,10 @@
-"""A camera that looks at a scene through the mirror: what focus does to its images, from the true surface.
+"""A camera that looks at a scene through the mirror; its images are computed from the true surface.
 
-The mirror stands in the entrance pupil (or in its image by an afocal relay), a lens of fixed focus behind it. The
-wavefront error of an object is twice the sag of the surface, figure and print-through included, plus what defocus is
-left of the lens and the object's distance; the squared modulus of the pupil's Fourier transform is the point spread
-function (Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4), with which the object's texture is folded.
-Objects stand side by side; that a near one hides parts of a blurred far one is left out. Exposure is instantaneous.
+The mirror is in the entrance pupil (or in its image by an afocal relay), with a lens of fixed focus behind it. The
+wavefront error of an object is twice the sag of the surface, figure and print-through included, plus the remaining
+defocus between lens and object distance. The squared modulus of the pupil's Fourier transform is the point spread
+function (Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4), with which the object's texture is convolved.
+Objects are side by side; that a near one hides parts of a blurred far one is neglected. Exposure is instantaneous.
 """
 
 import math
@@ -19,7 +19,7 @@ from scipy import fft
 from dm_common.values import live_parameter, parameter, real, reals, whole
 from dm_simulation.mirror.zernike import Array
 
-#: Surfaces closer than this [m] over the whole pupil give the same image: creep at rest needs no new one.
+#: Surfaces that differ by less than this [m] over the whole pupil give the same image: creep at rest needs no new one.
 SAME_SURFACE = 1e-9
 #: Grey level of the scene's mean brightness.
 MEAN_GREY = 100.0
@@ -61,12 +61,12 @@ class SceneCamera:
 
     Args:
         config: camera and scene.
-        pupil_diameter: of the mirror that is used, m.
-        scene_rng: draws the textures, once.
+        pupil_diameter: of the part of the mirror that is used, m.
+        scene_rng: draws the textures once.
         noise_rng: draws the noise of each image.
 
     Raises:
-        ValueError: a configuration that makes no sense, naming the parameter.
+        ValueError: an inconsistent configuration; the message names the parameter.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class SceneCamera:
     ) -> None:
         if not config.distances or min(config.distances) < 0:
             raise ValueError(f"camera.distances = {list(config.distances)}: must be one or more distances >= 0")
-        # An FFT over `extent` of the pupil plane gives a point spread function in pixels of the camera.
+        # The FFT of a pupil plane with sides of `extent` gives a point spread function in pixels of the camera.
         extent = config.wavelength * config.focal_length / config.pixel_pitch
         if extent < pupil_diameter:
             raise ValueError(
@@ -100,10 +100,10 @@ class SceneCamera:
         self.place(config.distances)
 
     def left_to_focus(self, distances: Sequence[float]) -> Array:
-        """For each object at these distances [m], as dioptre at the mirror: lens at rest minus object.
+        """Defocus of each object at these distances [m], as vergence at the mirror [1/m]: lens at rest minus object.
 
         Raises:
-            ValueError: there are more or fewer objects.
+            ValueError: the number of objects differs.
         """
         if len(distances) != len(self.config.distances):
             raise ValueError(f"camera.distances = {list(distances)}: must stay {len(self.config.distances)} distances")
@@ -111,7 +111,7 @@ class SceneCamera:
         return np.asarray((at_mirror[0] - np.array(at_mirror[1:])) / self.config.relay_magnification**2)
 
     def place(self, distances: Sequence[float]) -> None:
-        """Put the objects at other distances [m]. Raises ValueError as `left_to_focus` does."""
+        """Move the objects to other distances [m]. Raises ValueError as `left_to_focus` does."""
         self._defocus = self.left_to_focus(distances)
 
     def _scene(self, rng: np.random.Generator) -> list[NDArray[np.float32]]:
@@ -145,7 +145,7 @@ class SceneCamera:
 
     def expose(self, surface: Array) -> NDArray[np.uint8]:
         """An image (height, width) of the scene by a mirror of this surface (see `wavefronts`), 8 bit."""
-        defocus, last = self._defocus, self._last  # objects may be moved meanwhile
+        defocus, last = self._defocus, self._last  # taken once: objects may be moved meanwhile
         if last is None or last[0] is not defocus or 4 * np.abs(surface - last[1]).sum() > SAME_SURFACE:
             last = self._last = (defocus, surface, self._render(surface))
         ideal = last[2]

@@ -1,4 +1,4 @@
-"""Parameters of the node `virtual_bench`, and the bench configuration made of their values."""
+"""Parameters of the node `virtual_bench`, and the bench configuration made from their values."""
 
 import tempfile
 from collections.abc import Mapping
@@ -58,10 +58,10 @@ PARAMETERS = (
 
 
 def check_bench(values: Mapping[str, Any]) -> None:
-    """Build the bench of these values, away from its ports and folder, to see whether it can be built.
+    """Check that a bench of these values can be built, by building one without ports in a temporary folder.
 
     Raises:
-        ValueError: it cannot, naming the parameter.
+        ValueError: it cannot; the message names the parameter.
     """
     config = bench_config(values)
     with tempfile.TemporaryDirectory(prefix="virtual-bench-") as folder:

@@ -1,9 +1,9 @@
 """Node `virtual_bench`: simulation of mirror, drive electronics and interferometer.
 
-Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
+Other nodes access it as they access hardware: on the wire and by map files. ROS carries only what a person at the bench
 would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
-the images of the camera behind the mirror (`image_raw`, `camera_info`), which a driver of a real camera would publish;
-and the temperature of a plate on piezo stacks (`temperature`), which a sensor would.
+the images of the camera behind the mirror (`image_raw`, `camera_info`), which the driver of a real camera would
+publish; and the temperature of a plate on piezo stacks (`temperature`), which a sensor would publish.
 """
 
 import array
@@ -38,9 +38,9 @@ from dm_simulation.electronics.server import PortError
 from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.parameters import PARAMETERS, bench_config
 
-#: Longest wait for the driver to leave before this node does, s; `ros2 launch` loses patience after 5 s.
+#: Longest wait for the driver to end before this node does, s; `ros2 launch` waits for 5 s only.
 DRIVER_LEAVES_S = 4.0
-#: Time between two readings of the thermometer, s of the bench's time.
+#: Time between two readings of the thermometer, s of bench time.
 READING_S = 2.0
 
 
@@ -58,7 +58,7 @@ class VirtualBenchNode(Node):
         except PortError as error:
             raise OSError(f"{error}{held_by(error.port)}") from None
 
-        # Latched JSON object: the ports and paths really in use.
+        # Latched JSON object: the ports and paths actually in use.
         endpoints = self.create_publisher(String, "~/endpoints", qos.LATCHED)
         endpoints.publish(String(data=json.dumps(self.bench.endpoints)))
         WorkerService(self, Trigger, "~/trigger", self._trigger)
@@ -71,11 +71,11 @@ class VirtualBenchNode(Node):
             self._start(self._tick, values["clock.period"])
         if isinstance(self.bench.actuators, PiezoActuators):
             self._temperature_publisher = self.create_publisher(Temperature, "temperature", qos_profile_sensor_data)
-            # By the wall clock: the time of this node is the bench's, or somebody else's that may stand still.
+            # By the wall clock: this node's time is that of the bench, or of another source that may stand still.
             steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
             self.create_timer(max(READING_S / (speed or 1.0), 0.01), self._read_temperature, clock=steady)
         if self.bench.camera is not None:
-            # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
+            # Reliable: viewers that require it get images too. Depth 1: an image not fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
             self._info_publisher = self.create_publisher(CameraInfo, "camera_info", qos.MAP)
             self._camera_frame = f"{self.get_namespace()}/camera_optical".lstrip("/")  # REP 103
@@ -103,7 +103,7 @@ class VirtualBenchNode(Node):
             self.bench.camera.place(changes["camera.distances"])
 
     def _now(self) -> Time:
-        """The bench's time: with `clock.speed` that many times the wall clock, from the Unix time of the start on."""
+        """The bench's time: with `clock.speed`, that multiple of the wall clock, from the Unix time of the start on."""
         if self._speed:
             return Time(nanoseconds=self._began_ns + round(self._speed * (time.monotonic_ns() - self._origin_ns)))
         return self.get_clock().now()
@@ -178,9 +178,9 @@ class VirtualBenchNode(Node):
         return Health(OK, f"{record.frames} frames, {bench.maps_written} maps", values)
 
     def make_safe(self) -> None:
-        """Let the driver bring the mirror to its safe shape, then free ports and threads before the node goes.
+        """Let the driver bring the mirror to its safe shape, then free ports and threads before the node ends.
 
-        Ctrl-C reaches all processes of a launch at once; emulated hardware that left first would not be reached.
+        Ctrl-C reaches all processes of a launch at once; if the emulated hardware ended first, nobody could reach it.
         """
         deadline = time.monotonic() + DRIVER_LEAVES_S
         driver = ("pdm_driver", self.get_namespace())

@@ -1,1 +1,1 @@
-"""Where the focus is sharpest: state machines that are fed images or their sharpness; no cameras, no ROS."""
+"""Search of the sharpest focus: state machines that are fed images or their sharpness, without cameras or ROS."""

@@ -1,6 +1,6 @@
-"""How defocus changes the power that an image has at each spatial frequency, by the optics alone.
+"""How defocus changes the power of an image at each spatial frequency, computed from the optics alone.
 
-Seen at the curvature c, an object that is sharp at the curvature b has the power S(u) T(u, c - b) + N at the spatial
+At the curvature c, an object that is in focus at the curvature b has the power S(u) T(u, c - b) + N at the spatial
 frequency u: S is the power of the object's texture, T the squared modulation transfer of a circular pupil that is out
 of focus, N that of white noise. The pixels, and whatever else does not change with the focus, multiply S and need not
 be known. The transfer of a pupil of radius a with w waves of defocus at its edge is the autocorrelation of the pupil
@@ -21,34 +21,34 @@ from numpy.typing import NDArray
 from dm_autofocus.optics import depth_of_focus
 from dm_common import Floats
 
-#: Sides of the tiles that power is found in [px]: at most, and at least; and tiles along a side at most.
+#: Largest and smallest side of the tiles in which power is measured [px], and most tiles along a side.
 TILE_MAX, TILE_MIN, TILES = 256, 24, 3
-#: Bands at most, from the lowest frequency that a tile shows, in tiles' sides per cycle, up to half a cycle per pixel.
+#: Most bands, and the lowest frequency in cycles per side of a tile; the highest is half a cycle per pixel.
 BANDS, LOWEST = 20, 2.5
-#: Samples of the transfer in a band, nodes of its integral, and step of its table in depths of focus.
+#: Samples of the transfer per band, nodes of its integral, and step of its table in depths of focus.
 SAMPLES, NODES, STEP = 5, 96, 0.25
-#: A real pupil's transfer lies anywhere below the largest of the ideal one over defocuses that differ by this share.
+#: The transfer of a real pupil may be anything up to the largest ideal one over defocuses that differ by this share.
 SPREAD = 0.17
 
-#: Relative error of the transfer; of the noise, between images; leakage of power from lower bands.
+#: Relative error of the transfer; of the noise, between images; share of power that leaks in from lower bands.
 TRANSFER_ERROR, NOISE_ERROR, LEAKAGE = 0.25, 0.05, 0.002
-#: The same between images that are nearly alike, on either side of the focus.
+#: Relative error of the transfer between images that are nearly alike, on either side of the focus.
 TRANSFER_ERROR_NEAR = 0.1
-#: Images differ in their noise by this factor at most, as their brightness flickers.
+#: Largest ratio between the noise of images, as their brightness flickers.
 NOISE_RATIO = 1.1
-#: Power that is none.
+#: Negligible power (squared), which keeps variances above zero.
 TINY = 1e-18
 #: Factors on the focal length that are tried.
 SCALES = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-#: Images that count by their distance from the focus in steps of the table.
+#: Largest distance from the focus of images that are used, in steps of the table.
 FITTED = 48.0
-#: How much better another focal length must explain them to be named (twice a log ratio).
+#: How much better another focal length must explain the images to be named (twice a log ratio).
 BETTER = 60.0
 
 
 @dataclass(frozen=True)
 class FocusLens:
-    """What defocus looks like in a camera.
+    """Data of a camera that determine how defocus looks in it.
 
     Attributes:
         aperture_radius: of the beam on the mirror [m].
@@ -62,16 +62,16 @@ class FocusLens:
 
 
 class DefocusModel:
-    """Powers of images in bands of spatial frequency, and their share that passes a defocused pupil.
+    """Powers of images in bands of spatial frequency, and the share of them that passes a defocused pupil.
 
     Args:
-        shape: rows and columns of the images that `powers` will be given.
+        shape: rows and columns of the images that are given to `powers`.
         lens: of the camera.
-        reach: largest defocus that is asked for, as a difference of curvatures [1/m].
+        reach: largest defocus that is needed, as a difference of curvatures [1/m].
 
     Attributes:
         shape: as given.
-        modes: independent values that the power of each band is the mean of, (K,).
+        modes: number of independent values that are averaged in the power of each band, (K,).
 
     Raises:
         ValueError: the images are too small.
@@ -97,11 +97,11 @@ class DefocusModel:
         band = np.digitize(frequency, edges) - 1
         self._inside = (band >= 0) & (band < len(edges) - 1)
         self._band = band[self._inside]
-        # Frequencies along the first column come twice, with their negatives.
+        # Frequencies in the first column occur twice, with their negatives.
         self._share = np.where(np.arange(frequency.shape[1]) == 0, 0.5, 1.0)[None].repeat(rows, 0)[self._inside]
         self._count = np.bincount(self._band, self._share, len(edges) - 1)
         self._gradient = self._count * np.sin(np.pi * (edges[:-1] + edges[1:])) ** 2
-        # The window makes neighbours alike: 1.5 along each side.
+        # The window correlates neighbouring values: by a factor of 1.5 along each side.
         self.modes = self._count * len(self._starts) / 2.25
         self._step = STEP * depth_of_focus(lens.aperture_radius, lens.wavelength)
         self._look_through(lens, math.ceil(reach / self._step) + 2)
@@ -112,10 +112,10 @@ class DefocusModel:
         self._envelope = _envelope(self._transfer)
 
     def fitting_scale(self, focus: float, places: Floats, powers: Floats) -> float:
-        """How many times as large the focal length would have to be for the optics to explain images; 1 = they do.
+        """Factor on the focal length with which the optics explain the images best; 1 = the given one explains them.
 
         Between 0.35 and 2 it is 1: aberrations that blur an image at every focus look like a shorter focal length, and
-        errors of that size cost images, not accuracy. So it is where fewer than two images are near the focus.
+        errors of that size cost images, not accuracy. It is also 1 if fewer than two images are near the focus.
 
         Args:
             focus: where the object is [1/m].
@@ -156,15 +156,15 @@ class DefocusModel:
         return total / (self._count * len(self._starts))
 
     def sharpness(self, powers: Floats) -> float:
-        """Power of the gradient, by the powers (K,) of an image.
+        """Power of the image's gradient from its powers (K,).
 
-        As the Sobel gradient's, but what lies beside the middle of a tile counts less, so that what blurs in from
-        beside the region does.
+        As with the Sobel gradient, but the outer parts of a tile have less weight, and so has what blurs in from
+        outside the region.
         """
         return float(self._gradient @ powers)
 
     def transfer(self, defocus: Floats) -> tuple[Floats, Floats]:
-        """Share of the power that passes, and the largest that it may be for a pupil that is not ideal.
+        """Share of the power that passes, and the largest that this may be for a pupil that is not ideal.
 
         Args:
             defocus: difference of curvatures [1/m], (...).
@@ -183,18 +183,18 @@ class DefocusModel:
     def judge(
         self, grid: Floats, places: Floats, powers: Floats, error: float, stray: float = 0.0
     ) -> tuple[Floats, float]:
-        """What images say about where the object is.
+        """How well each place of the object explains the images.
 
         Args:
-            grid: places of the object that are thought of [1/m], (G,).
+            grid: candidate places of the object [1/m], (G,).
             places: where the images were taken [1/m], (I,).
             powers: of the images, (I, K).
-            error: relative, of the transfer.
-            stray: power that blurs in from beside the region, as a share of the least that an image has in a band.
+            error: relative error of the transfer.
+            stray: power that blurs in from outside the region, as a share of the least power of an image in a band.
 
         Returns:
             The misfit of each place of the grid, (G,): twice the negative logarithm of its likelihood; and by how much
-            the best place explains the images better than a scene that focus does not change.
+            the misfit of the best place is smaller than that of a scene that does not change with focus.
         """
         lowest = powers[:, -3:].min(1)
         noise = np.minimum(lowest, NOISE_RATIO * lowest.min())[:, None]
@@ -211,9 +211,9 @@ class DefocusModel:
     def _misfit(
         self, signal: Floats, noise: Floats, floor: Floats, shares: Floats, envelopes: Floats, error: float
     ) -> Floats:
-        """Twice the negative log likelihood (G,) of the signals (I, K) where shares (G, I, K) of the texture pass.
+        """Twice the negative log likelihood (G,) of the signals (I, K) if shares (G, I, K) of the texture pass.
 
-        The texture's power in each band is the one that fits best. Its variance follows from itself: a few rounds.
+        The texture's power in each band is fitted. Its variance depends on it, so a few iterations are made.
         """
         modes = self.modes
         guess = np.maximum(signal, 0)
@@ -228,7 +228,7 @@ class DefocusModel:
 
 
 def _band_edges(side: int) -> Floats:
-    """Edges of the bands [cycles per px], rising in equal ratios, but not closer than a tile can tell apart."""
+    """Edges of the bands [cycles per px], rising in equal ratios, but not closer than a tile can resolve."""
     edges = [LOWEST / side]
     ratio = (0.5 / edges[0]) ** (1 / BANDS)
     while edges[-1] < 0.5:

@@ -1,11 +1,11 @@
-"""Where the focus is, by a few images: how their power has changed with the focus, against the optics.
+"""Search of the focus with a few images: how their power changes with the focus, compared with the optics.
 
-A state machine as `PeakSearch`, for a mirror that stands where it is sent. Each image adds what it says about
+A state machine as `PeakSearch`, for a mirror that reaches the curvatures it is sent to. Each image adds information on
 every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
 the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
 probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
-confirms it: the top must stand above both. The place is the mean of the probability that the images near it leave, two
-on either side: where the pupil is not ideal, what one side says is wrong by as much as the other, the other way.
+confirms it: the top must be sharper than both. The result is the mean of the probability that the images near it give,
+two on either side: with a pupil that is not ideal, both sides err by the same amount in opposite directions.
 """
 
 import math
@@ -32,33 +32,33 @@ EVIDENCE = 25.0
 CERTAIN = 60.0
 #: Reason to give up.
 UNEXPLAINED = "the optics do not explain how the images change with focus"
-#: Images at most from where they change with focus on, and in most searches.
+#: Most images after the first sign of a change with focus, and the number that most searches need.
 MOST_IMAGES, EXPECTED_IMAGES = 18, 10
-#: Steps to either side of the focus, at least and at most, and how far beyond the range objects are thought of, in
-#: depths of focus. The last images are one and two steps to either side.
+#: Smallest and largest step to either side of the focus, and how far beyond the range objects are considered, in depths
+#: of focus. The last images are one and two steps to either side.
 SIDE, SIDE_MAX, BEYOND = 3.0, 9.0, 10.0
-#: Share of the least power of all images that may have blurred in from beside the region.
+#: Share of the least power of all images that may have blurred in from outside the region.
 STRAY = 0.5
-#: An image so many times as far above the least sharp as all but those within so many depths of focus of it, of which
-#: there are so many, is near the focus.
+#: An image is near the focus if it rises this many times as far above the least sharp one as all images further away
+#: than HILL depths of focus, of which there must be at least FAR_IMAGES.
 OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
-#: Where the last images are, and more of them while the standard error is above PRECISION, in steps.
+#: Places of the last images, and of further ones while the standard error is above PRECISION, in steps.
 LAST, MORE = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6)
-#: In depths of focus.
+#: Standard error below which no further images are needed, in depths of focus.
 PRECISION = 0.25
-#: Standard error with which no place is found, in depths of focus; how often a place may lead to another.
+#: Largest standard error of a place that is accepted, in depths of focus; most times that a fit is centred anew.
 WORST, RECENTRED = 1.5, 3
-#: How far from the focus an image is blurred rather than aberrated, in depths of focus; relative error of its transfer.
+#: Distance from the focus, in depths of focus, beyond which blur exceeds aberrations; relative error of its transfer.
 BLURRED, ERROR = 1.25, 0.17
 
 
 class DepthFromDefocus(Search):
-    """A search by few images, to its end or to where it gives up.
+    """A search with a few images, until it ends or gives up.
 
     Args:
         config: range and tolerance.
         model: of the camera.
-        start: where the mirror stands [1/m]; NaN = not known.
+        start: present curvature of the mirror [1/m]; NaN = not known.
 
     Attributes:
         gave_up: the reason why the images cannot be explained; "" = they can.
@@ -74,7 +74,7 @@ class DepthFromDefocus(Search):
         self._powers: list[Floats] = []
         self._sharpness: list[float] = []
         self._evidence = 0.0
-        self._blind = 0  # images until the last that left it open whether focus changes anything
+        self._blind = 0  # number of images up to the last after which it was open whether focus changes anything
         quarter = (config.high - config.low) / 4
         below, above = config.low + quarter, config.high - quarter
         self._first = (above, below) if abs(start - above) < abs(start - below) else (below, above)
@@ -106,7 +106,7 @@ class DepthFromDefocus(Search):
         """Choose the next step, or end."""
         config, tolerance = self.config, self.config.tolerance
         places, powers, grid = np.array(self._places), np.array(self._powers), self._grid
-        # Where the range was drawn in since, an image may lie beyond it: nothing is sought there.
+        # Images may be outside a range that was reduced since: they are not candidates for the focus.
         inside = (places >= config.low) & (places <= config.high)
         sharpness = np.where(inside, self._sharpness, -np.inf)
         misfit, evidence = self._model.judge(grid, places, powers, TRANSFER_ERROR, STRAY)
@@ -132,9 +132,9 @@ class DepthFromDefocus(Search):
             self._confirm(places, sharpness, int(np.where(near, sharpness, -np.inf).argmax()), side)
 
     def _hill(self, places: Floats, sharpness: Floats) -> NDArray[np.bool_]:
-        """Images that count: those near the sharpest where it stands far above all others, else all.
+        """Images that count: those near the sharpest if it is far sharper than all others, else all.
 
-        What stands at another distance beside the region blurs into it in images far from the focus.
+        In images far from the focus, objects at other distances beside the region blur into it.
         """
         near = np.abs(places - places[sharpness.argmax()]) < HILL * self.config.tolerance
         above = np.array(self._sharpness) - min(self._sharpness)
@@ -143,7 +143,7 @@ class DepthFromDefocus(Search):
         return np.ones(len(places), bool)
 
     def _confirm(self, places: Floats, sharpness: Floats, top: int, side: float) -> None:
-        """Take what is missing of an image on either side of the sharpest; with both, end."""
+        """Take a missing image on either side of the sharpest one; if there are both, end."""
         tolerance, offset = self.config.tolerance, places - places[top]
         three = [top]
         for sign in (-1, 1):
@@ -156,7 +156,7 @@ class DepthFromDefocus(Search):
                 self._go(wanted)
                 return
         if sharpness[top] < sharpness.max():
-            # What else is in the picture leads the model astray, not the sharpness.
+            # Other objects in the picture can mislead the model, but not the sharpness.
             self._confirm(places, sharpness, int(sharpness.argmax()), side)
             return
         place, error = self._fit(places, places[top], side)
@@ -180,10 +180,10 @@ class DepthFromDefocus(Search):
     def _fit(self, places: Floats, centre: float, side: float) -> tuple[float, float]:
         """Place of the focus and its standard error by the images around a centre [1/m].
 
-        Aberrations change the images in focus most, and what they say of the place least: those count only where there
-        are too few on either side of them. A place far from the centre becomes the centre: at the end of what is
-        thought of it would seem certain. The error is what the images say themselves, and by how much the place moves
-        when one of them is left out.
+        Aberrations change the images in focus most, and these images say least about the place: they are used only if
+        there are too few on either side. If the place is far from the centre, the fit is repeated about that place:
+        near the end of its grid it would seem certain. The error includes that of the images and the scatter of the
+        place when one of them is left out.
         """
         powers = np.array(self._powers)
 
@@ -210,9 +210,9 @@ class DepthFromDefocus(Search):
         return place, math.hypot(spread, math.sqrt(len(some) - 1) * float(without.std()))
 
     def _fill_gap(self, places: Floats) -> None:
-        """Next the middle of the widest gap; the end where none is wide enough to hide a focus.
+        """Choose the middle of the widest gap; end if none is wide enough to hide a focus.
 
-        Gaps are divided into equal parts, not halved: so no more images are needed than a sweep takes.
+        Gaps are divided into equal parts, not halved, so that no more images are needed than a sweep takes.
         """
         low, high, points = self.config.low, self.config.high, self.config.coarse_points
         ends = np.sort([low, *np.clip(places, low, high), high])
@@ -222,7 +222,7 @@ class DepthFromDefocus(Search):
         if parts < 2 and self.measured < NOISE_POINTS:
             self.step = Step(float(places[np.argmax(self._sharpness)]))
         elif parts < 2 and is_hill(np.array(self._sharpness)[places.argsort()], self.config.least_contrast):
-            # Things at several distances, say: sharpness finds its way without the optics.
+            # For example objects at several distances: a search by sharpness needs no optics.
             self._give_up(UNEXPLAINED)
         elif parts < 2:
             self.done = True

@@ -1,4 +1,4 @@
-"""The search of the node: from a few images where that is possible, else by sweeps."""
+"""The search of the node: from a few images if that is possible, else by sweeps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,22 +10,22 @@ from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import EXPECTED_IMAGES, DepthFromDefocus
 from dm_autofocus.search.peak_search import PeakSearch, SearchConfig
 
-#: How often a search begins anew as the images change their size.
+#: Most restarts of a search because the images change their size.
 MOST_CHANGES = 3
 
 
 class FocusSearch:
-    """A search from a few images where that is possible, and else, or when it gives up, a `PeakSearch`.
+    """A search from a few images if that is possible; otherwise, or when it gives up, a `PeakSearch`.
 
     Args:
         config: of both.
         model: of the camera, or the reason why there is none.
-        start: where the mirror stands [1/m]; NaN = not known.
+        start: present curvature of the mirror [1/m]; NaN = not known.
 
     Attributes:
-        current: what searches now: its `step`, `phase`, `done`, `peak` and `config` are those of the search.
+        current: the search in progress, with its `step`, `phase`, `done`, `peak` and `config`.
         reason: why the range is swept; "" = it is not.
-        unexplained: whether it is because the model did not find the focus.
+        unexplained: whether it is swept because the model did not find the focus.
     """
 
     def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
@@ -44,12 +44,12 @@ class FocusSearch:
 
     @property
     def steps(self) -> int:
-        """Positions to be measured, about."""
+        """Approximate number of positions to be measured."""
         swept = isinstance(self.current, PeakSearch)
         return max(self._before + self.current.config.steps if swept else EXPECTED_IMAGES, self.measured)
 
     def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
-        """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured.
+        """Report sharpness and images (H, W) at `current.step`; None if `step` was not to be measured.
 
         Raises:
             ValueError: the images change their size again and again: their sharpness cannot be compared.
@@ -60,7 +60,7 @@ class FocusSearch:
         if sharpness is None:
             pass
         elif powers is None:
-            self._seen.clear()  # of another size than these, whose sharpness they say nothing of
+            self._seen.clear()  # the images are of another size: their sharpness cannot be compared with the earlier
         else:
             assert self._model is not None  # else there are no powers
             seen = self._model.sharpness(powers)
@@ -94,12 +94,12 @@ class FocusSearch:
         self._sweep_after_all()
 
     def sweep(self, reason: str, approach: float) -> None:
-        """Sweep the range instead, each sweep from `approach` [1/m] below it."""
+        """Sweep the range instead, each sweep beginning `approach` [1/m] below its first position."""
         self.reason, self._before = reason, self.measured
         self.current = PeakSearch(replace(self.current.config, approach=approach))
 
     def fitting_scale(self) -> float:
-        """How many times as large the focal length should be to explain the images; 1 = as it is, or not known."""
+        """Factor on the focal length that explains the images; 1 = the given one does, or not known."""
         if self._model is None or self.current.peak is None or not self._seen:
             return 1.0
         places, powers, _sharpness = (np.array(part) for part in zip(*self._seen, strict=True))

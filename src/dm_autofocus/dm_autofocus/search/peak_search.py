@@ -1,15 +1,15 @@
 """Search of the sharpest focus: a state machine that is fed sharpness and says where to measure next.
 
-It knows nothing of cameras, mirrors or time. Whoever drives it goes to `step.curvature`, takes an image there when
+It is independent of cameras, mirrors and time. Its user goes to `step.curvature`, takes an image there if
 `step.measured` says so, and calls `feed`.
 
 Coarse to fine [23, 25]: a sweep over the whole range finds the hill, sweeps over two steps of the one before climb it,
 a parabola through the best points of the last gives its top. A sweep that sees the hill rise beyond its own end is
 repeated around that end.
 
-Where moves are not trusted (`approach` above 0), every sweep, and the final move to the top, first goes to the same
-turning point below. Hysteresis forgets what lies between two turning points once it is passed again, so that all of
-them rise on the same branch. Without that the hill that a long sweep saw is not where a short one expects it.
+If moves are not trusted (`approach` above 0), every sweep, and the final move to the top, first goes to the same
+turning point below. Passing a turning point again erases all smaller loops from the hysteresis, so that all sweeps
+rise on the same branch. Otherwise the hill that a long sweep saw would not be where a short one expects it.
 """
 
 import math
@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 
 from dm_common.values import parameter, real, whole
 
-#: Standard deviations of noise that the top of a hill must stand above the median of its sweep.
+#: Least height of the top of a hill above the median of its sweep, in standard deviations of the noise.
 SIGNIFICANCE = 6.0
-#: Standard errors of its mean that the sweep after it must stand above that median, too.
+#: Least height of the mean of the next sweep above that median, in standard errors.
 CONFIRMATION = 3.0
-#: Points from which on noise can be distinguished from a hill.
+#: Fewest points with which noise can be distinguished from a hill.
 NOISE_POINTS = 11
-#: Sweeps that may be repeated around their own end, per search.
+#: Most sweeps that are repeated around their own end, per search.
 MOST_SHIFTS = 8
-#: Share of the range that is given up where the mirror refuses its end, and how often.
+#: Share of the range that is given up each time the mirror refuses its end, and most such refusals.
 RETREAT = 0.03
 MOST_REFUSALS = 12
 
 
 class Phase(IntEnum):
-    """The same numbers as in dm_msgs/AutofocusState."""
+    """Phases, with the same numbers as in dm_msgs/AutofocusState."""
 
     IDLE = 0
     COARSE = 1
@@ -58,10 +58,10 @@ class SearchConfig:
 
     Attributes:
         low, high: range of curvatures [1/m], low < high.
-        tolerance: depth of focus: steps are not made finer than this [1/m], above 0.
+        tolerance: depth of focus [1/m], above 0; no step is finer.
         coarse_points: positions of the first sweep, at least 4.
-        fine_points, approach, least_contrast: see the parameters; an approach of 0: the mirror stands where it is sent,
-            wherever it comes from.
+        fine_points, approach, least_contrast: see the parameters; an approach of 0: the mirror reaches the curvatures
+            it is sent to from either direction.
     """
 
     low: float
@@ -81,7 +81,7 @@ class SearchConfig:
 
     @property
     def steps(self) -> int:
-        """Measured positions of a search that need not shift a sweep; each shift is one sweep more."""
+        """Number of measured positions of a search that shifts no sweep; each shift adds one sweep."""
         spacing = (self.high - self.low) / (self.coarse_points - 1)
         sweeps = 0
         while spacing > self.tolerance:
@@ -113,14 +113,14 @@ class Peak:
 
 
 class Search:
-    """One search from beginning to end: what all have in common.
+    """Base class of a search, from beginning to end.
 
     Attributes:
-        step: where to measure next; after the end, the curvature to stand at.
-        config: as given, the range as far as it was not refused.
-        phase: COARSE, or FINE from where a place is being confirmed.
+        step: where to measure next; after the end, the curvature to stay at.
+        config: as given, with the range reduced by what was refused.
+        phase: COARSE, or FINE once a place is being confirmed.
         done: nothing more is to be fed.
-        peak: what was found; None while it runs, and at its end when there was nothing to see.
+        peak: what was found; None during the search, and at its end if there was nothing to see.
         measured: positions measured so far.
     """
 
@@ -135,10 +135,10 @@ class Search:
         self._refusals = 0
 
     def _draw_in(self, first: float = -math.inf, last: float = math.inf) -> tuple[float, float]:
-        """Have the range end before `step`, which the mirror refused; what of it lies from `first` to `last` [1/m].
+        """Shrink the range to exclude `step`, which the mirror refused; returns its part from `first` to `last` [1/m].
 
         Raises:
-            ValueError: hardly anything.
+            ValueError: hardly anything of it is left.
         """
         config, here = self.config, self.step.curvature
         retreat = RETREAT * (config.high - config.low)
@@ -236,7 +236,7 @@ class PeakSearch(Search):
             self._around(float(self._positions[best]), spacing)
 
     def _rises_beyond(self, best: int) -> bool:
-        """Whether the largest value stands at an end of the sweep that is no end of the range."""
+        """Whether the largest value is at an end of the sweep that is not an end of the range."""
         first, last = self._positions[0], self._positions[-1]
         return (best == 0 and first > self.config.low) or (best == len(self._positions) - 1 and last < self.config.high)
 
@@ -249,8 +249,8 @@ def is_hill(seen: NDArray, least_contrast: float) -> NDArray[np.bool_]:
     """Whether sweeps rise by the least contrast, and by more than noise does.
 
     The noise is estimated from the second differences: those of a hill are small, or large at a few points only, which
-    the median passes over. The top of n points of white noise lies some two standard deviations above their median. Of
-    fewer than NOISE_POINTS points a hill may take most, and only the contrast counts.
+    the median ignores. The top of n points of white noise is about two standard deviations above their median. With
+    fewer than NOISE_POINTS points a hill may cover most of them, so only the contrast counts.
 
     Args:
         seen: sharpness along a sweep, (N, ...).
@@ -269,7 +269,7 @@ def is_hill(seen: NDArray, least_contrast: float) -> NDArray[np.bool_]:
 def _is_seen_again(coarse: np.ndarray, fine: np.ndarray) -> bool:
     """Whether the sweep around the top of a hill is higher than most of the sweep that saw it.
 
-    From some ten points the noise comes out far too small now and then: of 1000 sweeps over nothing, five to eight pass
+    With about ten points the noise is sometimes underestimated by far: of 1000 sweeps over nothing, five to eight pass
     for a hill, and hardly one of these does so a second time.
     """
     if len(coarse) < NOISE_POINTS:

@@ -1,9 +1,9 @@
 """Staying on the sharpest focus: state machines like `PeakSearch`, for a scene that changes.
 
-A `Tracker` goes by sharpness alone. A `MotionTracker` knows camera and mirror: the images of the last moments, taken
-half a dither below and above where the focus is believed to be, say through the optics (`DefocusModel`) where it is, if
-it moved at a speed. Each speed of a few is tried, with the images shifted by what the object has moved since. What is
-believed already weighs as a normal distribution of both.
+A `Tracker` uses sharpness alone. A `MotionTracker` knows camera and mirror: from the latest images, taken half a dither
+below and above the expected focus, the optics (`DefocusModel`) give its place for an assumed speed. Several speeds are
+tried, with the images shifted by what the object has moved since. The previous estimate enters as a normal distribution
+of place and speed.
 """
 
 import math
@@ -20,17 +20,17 @@ from dm_common.values import parameter, real, whole
 
 #: Share by which the normal sharpness follows each image.
 FORGETTING = 0.02
-#: Images before a change whose centre is gone back to: who comes in changes little at first.
+#: After a change the centre goes back by this many images: somebody who walks in changes little at first.
 BEFORE = 6
-#: Images that count at a time for a motion, and from how many on they say something.
+#: Most images that are used for a motion, and fewest that are needed.
 IMAGES, FEWEST = 5, 3
-#: How far from the believed place the focus is sought, and steps of that grid, in depths of focus.
+#: How far from the expected place the focus is sought, and step of that grid, in depths of focus.
 REACH, GRID = 12.0, 0.25
 #: Changes of speed that are tried at each image, in depths of focus per second.
 SPEEDS = 5.0 * np.arange(-3, 4)
-#: How far the range ends before what the mirror refuses, at least, in depths of focus.
+#: Least distance of the end of the range from what the mirror refuses, in depths of focus.
 STEP_BACK = 0.25
-#: Standard deviations of what is believed of place [depths of focus] and speed [depths of focus per second].
+#: Standard deviations of the previous estimates of place [depths of focus] and speed [depths of focus per second].
 PLACE_SIGMA, SPEED_SIGMA = 3.0, 8.0
 #: Share by which the period follows each image, and longest one that counts [s].
 PERIOD_SHARE, PERIOD_MAX = 0.3, 0.3
@@ -53,11 +53,11 @@ class TrackConfig:
 
 
 class Tracker:
-    """Follows a peak that was found: small trials below and above, and `lost` when the sharpness has dropped.
+    """Follows a peak that was found: small trials below and above it; `lost` once the sharpness has dropped.
 
-    What a lost peak needs is a new `PeakSearch`. Slow changes of the scene are taken as the new normal. Somebody who
-    walks through the region changes it at once, to either side, and is gone soon: the focus goes back to where it was
-    before, and waits.
+    A lost peak needs a new `PeakSearch`. Slow changes of the scene are accepted as normal. Somebody who walks through
+    the region changes the sharpness suddenly, up or down, and is gone soon: the focus goes back to where it was before,
+    and waits.
 
     Args:
         peak: what was found.
@@ -65,11 +65,11 @@ class Tracker:
         config: how to stay on it.
 
     Attributes:
-        centre: where the peak is believed to be [1/m].
+        centre: estimated place of the peak [1/m].
         sharpness: the normal sharpness there.
         step: where to measure next.
-        lost: search again.
-        hidden: the sharpness is another one at once, and may come back.
+        lost: a new search is needed.
+        hidden: the sharpness changed suddenly, and may return.
     """
 
     def __init__(self, peak: Peak, search: SearchConfig, config: TrackConfig) -> None:
@@ -87,7 +87,7 @@ class Tracker:
 
         Args:
             sharpness: of the images.
-            images: grey levels, (H, W) each; what knows the camera learns from them.
+            images: grey levels, (H, W) each; used by trackers that know the camera.
             time: when they were exposed [s].
 
         Raises:
@@ -108,7 +108,7 @@ class Tracker:
         """Report that the mirror cannot take `step`: the range ends before it.
 
         Args:
-            low, high: what it reaches now, about [1/m]; NaN = not known.
+            low, high: approximate range that it reaches now [1/m]; NaN = not known.
 
         Raises:
             ValueError: hardly anything of the range is left.
@@ -126,7 +126,7 @@ class Tracker:
         return min(max(place, self._search.low), self._search.high)
 
     def _watch(self, sharpness: float, time: float) -> None:
-        """Whether the peak is hidden or lost, by the sharpness of an image."""
+        """Update whether the peak is hidden or lost, by the sharpness of an image."""
         if not math.isfinite(sharpness):
             raise ValueError(f"sharpness = {sharpness}: must be a finite number")
         least = 1 - self._config.drop
@@ -147,7 +147,7 @@ class Tracker:
                 self.sharpness, self._changed, self.hidden = sharpness, 0, False
 
     def _move(self) -> None:
-        """Three trials, at the centre, below and above: go towards the top of their parabola."""
+        """After three trials, at the centre, below and above: go towards the top of their parabola."""
         middle, below, above = self._trial
         self._trial.clear()
         bend = below - 2 * middle + above
@@ -157,7 +157,7 @@ class Tracker:
 
 
 class MotionTracker(Tracker):
-    """A tracker for a camera and a mirror that are known.
+    """A tracker for a known camera and mirror.
 
     Args:
         peak, search: as of a `Tracker`.
@@ -201,7 +201,7 @@ class MotionTracker(Tracker):
         self._aim()
 
     def _estimate(self) -> None:
-        """Place and speed by the latest images."""
+        """Estimate place and speed from the latest images."""
         times, places, powers = (np.array(part) for part in zip(*self._images, strict=True))
         tolerance, ago = self._search.tolerance, times[-1] - times
         offsets = tolerance * np.arange(-REACH, REACH + GRID / 2, GRID)
@@ -220,6 +220,6 @@ class MotionTracker(Tracker):
         self.speed += tolerance * float(weights.sum(1) @ SPEEDS)
 
     def _aim(self) -> None:
-        """The next image: where the focus will be then, below and above by turns."""
+        """Choose the next image: at the expected place of the focus, alternately below and above it."""
         self._sign = -self._sign
         self.step = Step(self._inside(self.centre + self.speed * self._period + self._sign * self._dither))

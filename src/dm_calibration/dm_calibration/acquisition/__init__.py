@@ -1,1 +1,1 @@
-"""Maps from the instrument: a watched folder, a trigger, files read once they are complete."""
+"""Maps from the instrument: watched folder, trigger command, and reading of files once they are complete."""

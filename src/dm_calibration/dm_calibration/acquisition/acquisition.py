@@ -1,4 +1,4 @@
-"""Getting new map files out of the instrument: by a trigger command, or from the watched folder. Knows no ROS."""
+"""Getting new map files from the instrument: by a trigger command, or from the watched folder. Independent of ROS."""
 
 import math
 import queue
@@ -21,15 +21,15 @@ from dm_common.measurement import Measurement
 from dm_common.values import parameter, real, text, texts
 
 _POLL_OUTPUT_S = 0.01
-#: A watched file's modification time further in the past is not believed (clocks of two machines differ).
+#: A watched file's modification time is not believed if it is further in the past: clocks of two machines may differ.
 _RECENT_NS = 60 * 10**9
-#: A folder that cannot be read for so long is worth a warning, s: who makes it may be starting at the same time.
+#: An unreadable folder causes a warning after this time only, s: the program that creates it may still be starting.
 FOLDER_PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True)
 class AcquisitionSettings:
-    """Where maps come from; `folder`: see `watch_folder`, None = watch nothing."""
+    """Where maps come from; `folder`: the parameter `watch_folder`, None = no folder is watched."""
 
     folder: Path | None
     patterns: Sequence[str] = parameter(
@@ -74,7 +74,7 @@ class AcquisitionSettings:
 class Acquisition:
     """Watches the folder in a thread, and takes measurements on request.
 
-    A file that a request waits for goes to that request only; every other new file goes to `on_file`.
+    A file that a request waits for goes to that request only; every other new file is passed to `on_file`.
     """
 
     def __init__(
@@ -85,13 +85,13 @@ class Acquisition:
         on_file: Callable[[Path], None],
         on_trouble: Callable[[str], None],
     ) -> None:
-        """Prepare; nothing runs before :meth:`start`.
+        """Prepare; nothing happens before :meth:`start`.
 
         Args:
-            read: reads a map file, raising MapFileError for files that are not (yet) whole.
+            read: reads a map file; raises MapFileError for files that are not (yet) complete.
             now_ns: clock for the times of measurements.
             on_file: called in the watching thread with each new file.
-            on_trouble: called there with a sentence, once each: a file refused unread, or the folder unreadable.
+            on_trouble: called in that thread, once for each trouble: a file refused unread, or an unreadable folder.
         """
         self.settings = settings
         self.source = str(settings.folder or "files named to ingest_file only")
@@ -107,12 +107,12 @@ class Acquisition:
         self._handover = threading.Lock()
         self._waiting: queue.SimpleQueue[Path] | None = None
         self._before: set[Signature] = set()
-        self._from_ns = self._too_soon = 0  # files of earlier times do not count for a request, and how many came
+        self._from_ns = self._too_soon = 0  # earliest file time that counts for a request; number of earlier files
         self._numbers = count(1)
 
     def start(self) -> None:
-        """Begin to watch; what is in the folder now is not new."""
-        self._stop = threading.Event()  # a thread that is late to end still sees that of its own time
+        """Begin to watch; files that are in the folder now do not count as new."""
+        self._stop = threading.Event()  # a new event, so that a previous thread that ends late stays stopped
         if self.settings.folder is not None:
             self._watch = FolderWatch(self.settings.folder, self.settings.patterns, self.settings.stable_time)
             self._poll(self._watch)
@@ -131,14 +131,14 @@ class Acquisition:
         """Trigger a measurement, or wait for the next new file when there is no trigger command.
 
         Returns:
-            The oriented map, and what was found in it, of when the trigger command has it exposed; its time is not
-            known when the file came without a trigger.
+            The oriented map and its measurement, stamped with the time of exposure in the run of the trigger command,
+            or with 0 (not known) if the file came without a trigger.
 
         Raises:
             TriggerError: the trigger command failed.
-            MapFileError and what else `read` raises: the file that arrived is no good.
-            Refusal: MAP_TIMEOUT when no new map came in time, INTERFEROMETER_INACTIVE when :meth:`stop` was called
-                meanwhile, NOT_SUPPORTED when neither a trigger command nor a folder is configured.
+            MapFileError and whatever else `read` raises: the file that arrived is unusable.
+            Refusal: MAP_TIMEOUT if no new map came in time, INTERFEROMETER_INACTIVE if :meth:`stop` was called
+                meanwhile, NOT_SUPPORTED if neither a trigger command nor a folder is configured.
         """
         watch = self._watch
         if watch is None:
@@ -162,7 +162,7 @@ class Acquisition:
         return surface, replace(measured, stamp_ns=taken)
 
     def _trigger(self, output: Path | None, timeout_s: float) -> int:
-        """Run the trigger command; returns when the map was exposed, ns."""
+        """Run the trigger command; return the time of exposure, ns."""
         began = self._now_ns()
         run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
         self._check_stopped()
@@ -175,7 +175,7 @@ class Acquisition:
             )
 
     def _new_name(self, watch: FolderWatch) -> Path:
-        """A file name not used before, kept out of the watch: the measurement that asks for it takes it, or nobody."""
+        """A new file name that the watch ignores: only the measurement that asks for the file takes it."""
         if not watch.folder.is_dir():
             raise Refusal(ErrorCode.MAP_TIMEOUT, f"watch_folder = {str(watch.folder)!r}: no such folder")
         output = watch.folder / f"measure_{time.time_ns()}_{next(self._numbers)}{self.settings.trigger_suffix}"
@@ -183,7 +183,7 @@ class Acquisition:
         return output
 
     def _expected_file(self, path: Path, deadline: float) -> tuple[SurfaceMap, Measurement]:
-        """Read the file the trigger was told to write, which may still be growing."""
+        """Read the file that the trigger command was told to write, which may still be growing."""
         seen: tuple[int, int] | None = None
         since = time.monotonic()
         trouble: MapFileError | None = None
@@ -211,19 +211,19 @@ class Acquisition:
 
     @contextmanager
     def _arrivals(self, watch: FolderWatch, delay: float) -> Iterator[queue.SimpleQueue[Path]]:
-        """Where the next file in the folder arrives that is written from now on, and not before `delay` s are over."""
+        """Queue that receives the next file written from now on, but not earlier than `delay` s from now."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
             self._waiting, self._before, self._too_soon = arrivals, set(), 0
             self._from_ns = time.time_ns() + round(1e9 * delay) if delay else 0
-            with suppress(OSError):  # a folder that comes later
+            with suppress(OSError):  # the folder may appear later
                 self._before = set(watch.signatures().values())
         try:
             yield arrivals
         finally:
             with self._handover:
                 self._waiting = None
-            while not arrivals.empty():  # the trigger failed, or the time was up
+            while not arrivals.empty():  # the trigger failed, or the time was up: treat as any other new file
                 self._on_file(arrivals.get())
 
     def _next_file(
@@ -270,16 +270,16 @@ class Acquisition:
                 self._complain_at = now + FOLDER_PATIENCE_S
             if now >= self._complain_at:
                 self._on_trouble(self.folder_trouble)
-                self._complain_at = math.inf  # once
+                self._complain_at = math.inf  # only once
             return []
         self.folder_trouble, self._complain_at = "", None
         return events
 
     def _hand_over(self, event: FileEvent) -> None:
         with self._handover:
-            # A file from before the request shows the mirror as it was then, however late it is noticed.
+            # A file written before the request shows the earlier shape, however late it is noticed.
             if self._waiting is not None and event.signature not in self._before:
-                if min(event.signature.modified_ns, time.time_ns()) >= self._from_ns:  # whatever its clock says
+                if min(event.signature.modified_ns, time.time_ns()) >= self._from_ns:  # file times may be ahead
                     self._waiting.put(event.path)
                     self._waiting = None  # one file per request
                     return
@@ -288,10 +288,10 @@ class Acquisition:
 
 
 def measured_ns(surface: SurfaceMap, now_ns: int, believe_header: bool) -> int:
-    """When the map in a file was measured, ns: by the file where that can be right, else `now_ns`.
+    """When the map in a file was measured, ns: as the file says if that is plausible, else `now_ns`.
 
     Args:
-        believe_header: the time in the file, however old; else when the file was written, if that was recent.
+        believe_header: use the time in the file, however old; else the modification time of the file, if recent.
     """
     if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now_ns:
         return round(surface.time_stamp * 1e9)

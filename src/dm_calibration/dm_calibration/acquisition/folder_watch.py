@@ -1,8 +1,8 @@
-"""Watching a folder for files that another machine writes. Knows no ROS.
+"""Watching a folder for files that another machine writes. Independent of ROS.
 
-A file is taken when its size and time have stood still for a while, or at once when this machine's kernel tells that
-its writer has closed it and it is as long as it says itself. Nothing depends on clocks of two machines agreeing:
-stillness is judged by this machine's monotonic clock.
+A file is taken once its size and modification time have not changed for a while, or at once if this machine's kernel
+reports that its writer closed it and its length is the one stated in its header. The clocks of two machines need not
+agree: times are measured by this machine's monotonic clock.
 """
 
 import fnmatch
@@ -16,7 +16,7 @@ from dm_calibration.map_files import is_complete
 
 
 class Signature(NamedTuple):
-    """What changes when a file is written."""
+    """Properties of a file that change when it is written."""
 
     inode: int
     size: int
@@ -31,7 +31,7 @@ class _Candidate:
 
 
 class FileEvent(NamedTuple):
-    """A file that is ready, or refused with the reason, and what it looked like then."""
+    """A file that is ready, or refused with the reason, with its signature at that time."""
 
     path: Path
     signature: Signature
@@ -39,17 +39,17 @@ class FileEvent(NamedTuple):
 
 
 class FolderWatch:
-    """Finds files that are new in a folder (not below it), each state of a file once.
+    """Finds new files in a folder (not in subfolders), each state of a file once.
 
-    Files that exist at the first listing that succeeds are not new, until they are written again.
+    Files that exist at the first successful listing do not count as new until they are written again.
     """
 
     def __init__(self, folder: Path, patterns: Sequence[str], stable_time: float) -> None:
-        """Nothing is touched before the first :meth:`poll`: the folder may be on a disk that is mounted later.
+        """Nothing is accessed before the first :meth:`poll`: the folder may be on a disk that is mounted later.
 
         Args:
             patterns: shell patterns of file names, case-insensitive; names that begin with a dot never match.
-            stable_time: s for which size and time must not change.
+            stable_time: s for which size and modification time must not change.
         """
         self.folder = folder
         self._patterns = [pattern.lower() for pattern in patterns]
@@ -58,16 +58,16 @@ class FolderWatch:
         self._ignored: set[str] = set()
 
     def ignore(self, path: Path) -> None:
-        """Never report this file, whatever becomes of it."""
+        """Never report this file."""
         self._ignored.add(path.name)
 
     def poll(self, now: float) -> list[FileEvent]:
         """List the folder; `now` is a monotonic time in s.
 
-        Returns what became ready since the last listing, oldest first.
+        Returns the files that became ready since the last listing, oldest first.
 
         Raises:
-            OSError: the folder cannot be read now; what is known is kept.
+            OSError: the folder cannot be read now; the known files are kept.
         """
         listed = self.signatures()
         if self._known is None:
@@ -85,9 +85,9 @@ class FolderWatch:
         return [event for _time, event in sorted(ready)]
 
     def closed(self, names: Iterable[str], now: float) -> list[FileEvent]:
-        """Check files whose writer has just closed them, as far as they are known to be whole, which need not wait.
+        """Check files that their writer has just closed; those known to be complete are ready without waiting.
 
-        Others are left to :meth:`poll`, so are those that it would refuse.
+        All others, including those that would be refused, are left to :meth:`poll`.
         """
         ready = []
         for name in names:
@@ -103,7 +103,7 @@ class FolderWatch:
         return ready
 
     def signatures(self) -> dict[str, Signature]:
-        """Of the matching names that are there now; for links, of what they point to.
+        """Signatures of the matching names that exist now; of links, those of their targets.
 
         Raises:
             OSError: the folder cannot be read now.
@@ -112,7 +112,7 @@ class FolderWatch:
         return {name: signature for name, signature in seen.items() if signature is not None}
 
     def _signature(self, name: str) -> Signature | None:
-        """Of a file that is watched for; None = of none such, or it is gone again, or a link to nowhere."""
+        """Signature of a watched file; None if it is not watched, no longer exists, or is a dangling link."""
         if name in self._ignored or not self._matches(name):
             return None
         try:

@@ -1,4 +1,4 @@
-"""From a map file to the figures the suite works with: oriented map, aperture, Zernike fit, samples. Knows no ROS."""
+"""From a map file to oriented map, aperture, Zernike fit and samples. Independent of ROS."""
 
 import threading
 from dataclasses import astuple, dataclass, field, replace
@@ -26,10 +26,10 @@ from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_common.optics.zernike import basis
 from dm_common.values import live_parameter, parameter, real, reals, switch, text
 
-#: Maps are searched for phase steps where the terms leave more than this at a sampling point, in wavelengths; a step of
-#: a fringe leaves more wherever it ends, and goes unseen only where its region lies between the points.
+#: Maps are searched for phase steps if the fit leaves more than this at a sampling point, in wavelengths. A step of one
+#: fringe leaves more at its edge; it is missed only if its region lies between the sampling points.
 STEP_SHARE = 0.125
-#: A file whose pitch differs by more than this from the one that is known better is of another zoom.
+#: Relative difference of pitch from which a file is taken to come from another zoom setting.
 ZOOM_SHARE = 0.05
 
 
@@ -39,9 +39,9 @@ class IngestSettings:
 
     Attributes:
         orientation: from the instrument's picture to the mirror frame.
-        mirror_radius: m; no aperture_radius is larger. 0 = not known.
+        mirror_radius: m, upper limit of aperture_radius; 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
-        reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
+        reference: the instrument's own error, subtracted from every map before orientation; None = not known.
     """
 
     orientation: Orientation = field(default_factory=Orientation)
@@ -77,7 +77,7 @@ class IngestSettings:
         "Lateral resolution per pixel, as `./dm measure --reference-sphere METRES` finds it; files that tell one "
         "that differs by more than 5 % are refused. 0 = as the files tell.",
     )
-    # Retrace and distortion are taken off then; see `dm_calibration.optics.instrument`.
+    # Retrace error and distortion are subtracted then; see `dm_calibration.optics.instrument`.
     retrace: tuple[float, ...] = parameter(
         reals([], -1.0, 1.0),
         "Error that goes with tilt, 36 numbers, as `./dm instrument retrace FILES` finds them; empty = none.",
@@ -106,7 +106,7 @@ class IngestSettings:
 
     @property
     def corrections(self) -> str:
-        """What is kept with maps of the errors of the instrument that were taken off them; "" = none were."""
+        """Text on the instrument errors that were subtracted from the maps, stored with them; "" = none were."""
         parts = []
         if self.reference is not None:
             parts.append(f"{Path(self.reference.file).name}, SHA-256 {self.reference.sha256}")
@@ -118,33 +118,33 @@ class IngestSettings:
 
 
 def too_large(radius: float, mirror_radius: float) -> str:
-    """That a configured aperture does not fit on the mirror, as a sentence; radii in m, of the mirror 0 = not known."""
+    """A sentence if the configured aperture is larger than the mirror, else ""; m, mirror_radius 0 = not known."""
     if not radius > mirror_radius > 0.0:
         return ""
     return f"aperture.radius = {radius:g} m: the mirror has a radius of {mirror_radius:g} m (mirror_info)"
 
 
 class Ingest:
-    """Reads and fits map files, one at a time however many threads ask, so that memory stays flat."""
+    """Reads and fits map files, one at a time however many threads ask, so that memory use stays constant."""
 
     def __init__(self, sample_count: int = 500) -> None:
         self.points = edge_clustered_points(sample_count)
         self._terms = basis(self.points.x, self.points.y)
         self._turn = threading.Lock()
-        self._fitter: MapFitter | None = None  # of the last mask: dropouts often stay where they are
+        self._fitter: MapFitter | None = None  # for the last mask, which often repeats: dropouts tend to stay in place
 
     def read(self, path: Path, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-        """Read, orient and fit one file: the oriented map, and what was found in it.
+        """Read, orient and fit one file: returns the oriented map and its measurement.
 
-        Piston and tilt stay in coefficients and samples. The digest of the file is left to
-        :attr:`SurfaceMap.sha256`, the time to whoever knows the clock.
+        Coefficients and samples include piston and tilt. The digest of the file is left to :attr:`SurfaceMap.sha256`,
+        the time stamp to the caller.
 
         Raises:
             MapFileError: the file is not a whole, readable map.
             InsufficientDataError, NoValidPixelsError: too few valid pixels.
-            MapRejectedError: another wavelength than expected, another setting than the reference surface, an aperture
-                in m for a map without a pitch, one that is larger than the mirror, or a region that stands off by no
-                whole number of fringes.
+            MapRejectedError: another wavelength than expected, other settings than the reference surface, an aperture
+                in m for a map without a pitch, an aperture larger than the mirror, or a region that is off by a
+                non-integer number of fringes.
         """
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
@@ -159,7 +159,7 @@ class Ingest:
             return self._measure(source, settings)
 
     def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-        if not source.wavelength:  # the file does not tell it
+        if not source.wavelength:  # not given in the file
             source = replace(source, wavelength=settings.wavelength)
         difference = abs(source.wavelength - settings.wavelength)
         if settings.wavelength and difference > settings.wavelength_tolerance:
@@ -185,7 +185,7 @@ class Ingest:
         aperture, followed = self._aperture(surface.valid, pitch, settings)
         circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
         if self._fitter is None or not self._fitter.fits(surface.valid, aperture):
-            self._fitter = None  # not two workspaces at a time
+            self._fitter = None  # free it first: two workspaces would double the memory
             self._fitter = MapFitter(surface.valid, *circle)
         if self._fitter.valid_fraction < settings.valid_fraction_min:
             raise InsufficientDataError(
@@ -231,7 +231,7 @@ class Ingest:
     def _aperture(
         valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings
     ) -> tuple[Aperture, tuple[float, float]]:
-        """The aperture, and `Measurement.followed`."""
+        """The aperture, and the value of `Measurement.followed`."""
         nothing = (0.0, 0.0)
         if settings.aperture_radius == 0:
             return find_aperture(valid), nothing

@@ -1,6 +1,6 @@
-"""News from the kernel of files that were written: at once, where polling would wait for them to stand still.
+"""Notification by the kernel of files that were written: at once, where polling must wait until they are stable.
 
-Linux tells of writers on this machine only (inotify(7)); what another one writes to a shared folder shows by polling.
+Linux reports only writers on this machine (inotify(7)); files that another machine writes are found by polling.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ RETRY_S = 1.0
 class ClosedFiles:
     """Names of files in one folder that their writer has closed, or that were moved there under their name.
 
-    Nothing is raised where the kernel cannot tell: then nothing comes.
+    If the kernel offers no inotify, no error is raised and no names are reported.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -31,7 +31,7 @@ class ClosedFiles:
         self._tried = -RETRY_S
 
     def wait(self, seconds: float) -> list[str]:
-        """Names that came, as soon as one does; empty after `seconds`."""
+        """Names as soon as at least one is reported; empty after `seconds`."""
         if not self._watching and time.monotonic() >= self._tried + RETRY_S:
             self._watch()
         if self._descriptor < 0:

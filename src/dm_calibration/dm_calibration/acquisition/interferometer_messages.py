@@ -19,14 +19,14 @@ def image_message(surface: SurfaceMap, header: Header) -> Image:
     """The map as 32FC1, metres, NaN = no data."""
     height, width = surface.sag.shape
     message = Image(header=header, height=height, width=width, encoding="32FC1", is_bigendian=0, step=4 * width)
-    # An array.array is taken over as it is; anything else is checked byte by byte.
+    # An array.array is taken over without copying; any other type is checked byte by byte.
     message.data = array.array("B")
     message.data.frombytes(surface.sag.astype("<f4").data.cast("B"))
     return message
 
 
 def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> SurfaceMapInfo:
-    """What the file says of a map, and what was found in it."""
+    """Facts on a map from its file and from its measurement."""
     return SurfaceMapInfo(
         header=header,
         width=measured.camera[0],
@@ -57,7 +57,7 @@ def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficient
 
 
 def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
-    """The surface that a sensor has seen, and what its terms leave unexplained, m.
+    """The surface that a sensor measured, and the residual that its terms leave, m rms.
 
     Raises:
         MapRejectedError: an unknown convention, too few terms, or values that are not finite.

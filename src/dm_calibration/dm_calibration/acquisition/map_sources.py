@@ -1,4 +1,4 @@
-"""Maps that were not measured by a run of this suite: files, arrays or measurements, with the commands they show."""
+"""Maps not measured by a run of this suite: files, arrays or measurements, with their commands."""
 
 import time
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ from dm_common.mirror import Mirror
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
-#: Times lie within this, s: stamps are int64 numbers of ns.
+#: Largest absolute time, s: stamps are int64 numbers of ns.
 TIME_MAX_S = 9e9
 
-#: What an array spans is less, m: else it is of another unit.
+#: Largest peak-to-valley sag of an array, m: a larger one indicates another unit.
 SAG_MAX = 1e-3
 
-#: Endings of the map files that are taken from a folder, in small letters; those of files may be in capitals.
+#: Suffixes, in lower case, of the map files that are taken from a folder; upper case is accepted as well.
 SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4d")
 
 
@@ -42,10 +42,10 @@ def outcome_of(
     settings: IngestSettings | None = None,
     hysteresis: bool = False,
 ) -> Outcome:
-    """The maps as if a run had measured them, in their order; the files of a folder in that of their names.
+    """The maps in their order, as if a run had measured them; files of a folder are sorted by name.
 
-    Args and errors as of :func:`~dm_calibration.calibrator.calibrate`. Where neither `times` nor the files tell when
-    all maps were taken, they count as one second apart, the last as just now.
+    Args and errors as for :func:`~dm_calibration.calibrator.calibrate`. If neither `times` nor the files give the times
+    of all maps, they are set one second apart, the last one to the present.
     """
     settings = settings or IngestSettings(aperture_radius=mirror.working_radius)
     measured, dropped = _measured(maps, settings, hysteresis)
@@ -77,14 +77,14 @@ def outcome_of(
     if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
         raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
     outcome = Outcome()
-    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # who never moves may stand anywhere
+    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # an actuator that never moves is at rest
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
     kinds = _kinds(np.abs(signals - rest) > 1e-9, hysteresis)
     for number, (one, row, kind) in enumerate(zip(measured, signals, kinds, strict=True)):
         label = f"{number + 1} {Path(one.file).name}" if one.file else f"map {number + 1}"
         if number in dropped:
             outcome.dropped.append(f"{label}: {dropped[number]}")
-            kind = StepKind.EXCITATION if kind == StepKind.REFERENCE else kind  # no figure is followed from it
+            kind = StepKind.EXCITATION if kind == StepKind.REFERENCE else kind  # a reference needs a map
         try:
             check_comparable(one, outcome, mirror.working_radius)
         except MeasurementError as error:
@@ -92,7 +92,7 @@ def outcome_of(
         if outcome.setup is None:
             outcome.take(Setup.of(one))
             if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
-                # No map shows where the degauss ended, and a mirror that is driven one way ends it elsewhere than at 0.
+                # No map shows the end of the degauss, which on a mirror driven in one direction is not at 0.
                 begin = {"kind": StepKind.REFERENCE, "step": -1, "signals": rest, "applied": rest}
                 outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **begin))
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
@@ -101,13 +101,13 @@ def outcome_of(
 
 
 def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Measurement], dict[int, str]]:
-    """One measurement a map; those from files with their time and digest.
+    """One measurement per map; those from files with time and digest.
 
     Args:
-        gaps: a map with too few data leaves a command without a map, which belongs to the history of the actuators.
+        gaps: whether a map with too few data is replaced by a gap, so that its command stays in the actuators' history.
 
     Returns:
-        Them, and by its index why a map leaves a gap.
+        The measurements, and by index the reason for each gap.
     """
     if isinstance(maps, str | Path):
         folder = Path(maps)
@@ -134,12 +134,12 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
 
 
 def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: IngestSettings) -> Measurement:
-    """The measurement that a file or an array (height, width), m, gives; `number`: its index."""
+    """The measurement from a file or an array (height, width), m; `number`: its index."""
     if isinstance(one, str | Path):
         surface, measured = ingest.read(Path(one), settings)
-        # Not when they were written: copies tell when they were copied.
+        # Not the modification time: for copies that is the time of copying.
         return replace(measured, stamp_ns=round(1e9 * (surface.time_stamp or 0.0)), sha256=surface.sha256)
-    sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # what is masked has no data
+    sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data
     if sag.ndim != 2:
         raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
     seen = sag[np.isfinite(sag)]
@@ -154,7 +154,7 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
 
 
 def _kinds(away: NDArray[np.bool_], hysteresis: bool) -> list[StepKind]:
-    """(M,) kinds of the maps, as a run would have called them, by which actuators (M, N) are away from rest."""
+    """(M,) kinds that a run would have given the maps; `away` (M, N): which actuators are away from rest."""
     if hysteresis:
         tested = round((1.0 - CHECK_SHARE) * len(away))
         kinds = [StepKind.EXCITATION if number < tested else StepKind.CHECK for number in range(len(away))]

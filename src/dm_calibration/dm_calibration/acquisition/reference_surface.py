@@ -1,4 +1,4 @@
-"""The instrument's own error: a map of it, which is subtracted from every other. What is left is absolute."""
+"""The instrument's own error: a map of it is subtracted from every other map, which makes results absolute."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
 
-#: How the reference surface is called in sentences: as the parameter that names its file.
+#: Name of the reference surface in messages: that of the parameter with its file.
 NAME = "reference_surface"
 
 
@@ -33,10 +33,10 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
 
 
 def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float) -> Floats:
-    """(height, width) m, of a map as the instrument shows it, less the reference surface; NaN where either has no data.
+    """(height, width) m, a map as the instrument shows it less the reference surface; NaN where either has no data.
 
     Args:
-        pitch: of files that do not tell it, m per pixel; 0 = not known.
+        pitch: m per pixel, for files that do not contain it; 0 = not known.
 
     Raises:
         MapRejectedError: see :func:`difference`.
@@ -49,10 +49,10 @@ def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavele
 def difference(
     source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float, name: str = NAME
 ) -> str:
-    """Why a map cannot be set against another, called `name`; "" = it can.
+    """Why a map cannot be compared with a reference, called `name` in the sentence; "" = it can.
 
-    They are of another size, place on the camera, pitch or wavelength, or the instrument has subtracted its error from
-    the map already. Args as of :func:`absolute_sag`.
+    Either they differ in size, place on the camera, pitch or wavelength, or the instrument has already subtracted its
+    error from the map. Args as for :func:`absolute_sag`.
     """
     size = "{1} x {0} pixels from column {2}, row {3} of the camera"
     here, there = ((*each.sag.shape, *each.origin) for each in (source, reference))

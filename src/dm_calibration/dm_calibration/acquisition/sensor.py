@@ -1,4 +1,4 @@
-"""Measurements from a sensor that publishes Zernike coefficients, on request. Knows no ROS."""
+"""Measurements, on request, from a sensor that publishes Zernike coefficients. Independent of ROS."""
 
 import threading
 import time
@@ -15,10 +15,10 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import basis
 
-#: Pixels along a side of the map that coefficients are drawn as.
+#: Width and height, in pixels, of the map that is drawn from coefficients.
 PIXELS = 256
 
-#: A surface and what the sensor leaves unexplained, m rms.
+#: A surface, and the residual that the sensor reports, m rms.
 Seen = tuple[SurfaceMap, float]
 
 
@@ -31,29 +31,29 @@ def disc_terms() -> NDArray[np.float64]:
 
 
 def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-    """Map and measurement of what a sensor has seen: over the aperture that is configured, else over its own.
+    """Map and measurement from what a sensor saw: over the configured aperture, else over that of the sensor.
 
     Raises:
         MapRejectedError, InsufficientDataError: see :class:`Ingest`.
     """
     surface, residual_rms = seen
-    settings = replace(settings, pitch=0.0)  # which is that of a camera
+    settings = replace(settings, pitch=0.0)  # the parameter applies to a camera only
     if not settings.aperture_radius and surface.pitch:
         settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
     surface, measured = ingest.measure(surface, settings)
-    sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exactly, also between pixels
+    sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exact, also between pixels
     unknown = np.full_like(measured.coefficients, np.nan)
     return surface, replace(measured, residual_rms=residual_rms, sag=sag, sigma=unknown)
 
 
 class SensorAcquisition:
-    """Takes the first measurement that was begun after a request; those between requests are let go.
+    """Takes the first measurement begun after a request; measurements between requests are ignored.
 
     Args:
-        read: makes a map of its aperture, and what was found in it, of what the sensor has seen.
+        read: makes the map and the measurement from what the sensor saw.
     """
 
-    #: The sensor leaves no files.
+    #: Always "": a sensor uses no folder.
     folder_trouble = ""
 
     def __init__(
@@ -76,17 +76,17 @@ class SensorAcquisition:
             self._changed.notify_all()
 
     def offer(self, seen: Callable[[], Seen], stamp_ns: int) -> None:
-        """Something the sensor has seen at `stamp_ns`; made out where somebody waits for it."""
+        """Offer what the sensor saw at `stamp_ns`; `seen` is evaluated only if a request waits for it."""
         with self._changed:
             if 0 <= self._since <= stamp_ns and self._seen is None:
                 self._seen = seen, stamp_ns
                 self._changed.notify_all()
 
     def acquire(self, timeout_s: float) -> tuple[SurfaceMap, Measurement]:
-        """The next measurement, with its time.
+        """The next measurement, with its time stamp.
 
         Raises:
-            MapRejectedError and what else `read` raises: it is no good.
+            MapRejectedError and whatever else `read` raises: the measurement is unusable.
             Refusal: MAP_TIMEOUT when none came in time, INTERFEROMETER_INACTIVE when :meth:`stop` was called meanwhile.
         """
         deadline = time.monotonic() + timeout_s

@@ -1,4 +1,4 @@
-"""Running the command that makes the interferometer take a map. Knows no ROS."""
+"""Running the command that makes the interferometer take a map. Independent of ROS."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from typing import IO
 
 from dm_common.errors import CodedError, ErrorCode
 
-#: In an argument of the command: the file the instrument is expected to write.
+#: In an argument of the command, stands for the file that the instrument is expected to write.
 PLACEHOLDER = "{path}"
 
 _OUTPUT_SHOWN = 500  # characters of the command's output in an error message
@@ -21,13 +21,13 @@ _POLL_S = 0.01
 
 
 class TriggerError(CodedError):
-    """The command could not be started, failed, or took too long; the message has the end of its output."""
+    """The command could not be started, failed, or took too long; the message shows the end of its output."""
 
     error_code = ErrorCode.TRIGGER_FAILED
 
 
 def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, cancelled: threading.Event) -> None:
-    """Run the command (an argument list; no shell is involved) and wait for its end, or until it is `cancelled`.
+    """Run the command (an argument list; no shell is involved) and wait until it ends or `cancelled` is set.
 
     The command runs in its own process group, which is killed as a whole on time-out or cancellation.
 
@@ -38,7 +38,7 @@ def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, c
         TriggerError: it cannot be started, ends with a status other than 0, or does not end in time.
     """
     arguments = [argument.replace(PLACEHOLDER, str(output)) for argument in command]
-    # Output goes to a file, not a pipe: nothing it leaves running can keep this call waiting.
+    # Output goes to a file, not a pipe: processes that the command leaves running cannot block this call.
     with tempfile.TemporaryFile() as log:
         try:
             process = subprocess.Popen(
@@ -58,7 +58,7 @@ def run_trigger(command: Sequence[str], output: Path | None, timeout_s: float, c
         finally:
             if process.poll() is None:
                 with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)  # with all it started
+                    os.killpg(process.pid, signal.SIGKILL)  # with all its child processes
                 process.wait()
         if status != 0:
             raise TriggerError(f"trigger command {arguments[0]!r} ended with status {status}{_tail(log)}")

@@ -17,7 +17,7 @@ from dm_calibration.store.hdf5_sandbox import SandboxError, read_in_sandbox
 
 __all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "is_complete", "read_map"]
 
-#: Larger files are refused before they are read; the largest map in the wordiest format stays below.
+#: Larger files are refused unread; the largest map in the most verbose format is smaller.
 MAX_FILE_BYTES = 2**30
 
 _START_BYTES = 4096
@@ -26,19 +26,19 @@ _START_BYTES = 4096
 def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> SurfaceMap:
     """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file, a FITS file, or one of 4Sight.
 
-    The format is found from the content; the suffix matters only between the two text formats, whose titles are
+    The format is recognised by the content; the suffix matters only between the two text formats, whose titles are
     sometimes mixed up.
 
     Args:
         xyz_unit: unit of the values of an `.xyz` file, one of XYZ_UNITS, and of a FITS file without BUNIT; other
-            formats know theirs.
+            formats contain their unit.
 
     Raises:
-        MapFileError: not a whole, readable map; the message names the file, the field, its value and what is allowed.
+        MapFileError: not a complete, readable map; the message names file, field, value and what is allowed.
         NoValidPixelsError: whole, but without a valid pixel.
     """
     path = Path(path)
-    name = as_text(path)  # a name that is no UTF-8 goes into no message
+    name = as_text(path)  # for messages, which must be valid UTF-8
     if "\0" in str(path):
         raise MapFileError(f"path = {str(path)!r}: must not contain a NUL character")
     try:
@@ -49,15 +49,15 @@ def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> Su
     except MapFileError as error:
         raise type(error)(f"{name}: {error}") from error
     written_ns = 0
-    with contextlib.suppress(OSError):  # what was read is good, even if it is gone since
+    with contextlib.suppress(OSError):  # the file may have been removed since; what was read is valid
         written_ns = path.stat().st_mtime_ns
     return dataclasses.replace(surface_map, file=name, written_ns=written_ns, content=content)
 
 
 def is_complete(path: Path) -> bool:
-    """True for a `.dat` or `.datx` file of exactly the length it tells; False for others, and for what is no file.
+    """True for a `.dat` or `.datx` file whose length is the one stated in its header; else False, also if not a file.
 
-    Formats that do not tell their length are never known to be whole.
+    Formats that do not state their length are never known to be complete.
     """
     try:
         with open(path, "rb", opener=_open_without_waiting) as file:
@@ -67,10 +67,10 @@ def is_complete(path: Path) -> bool:
 
 
 def _agrees(start: bytes, length: int) -> bool:
-    """Whether the first bytes of a file tell that it is `length` bytes long; False where its format does not tell.
+    """Whether the first bytes of a file state a length of `length` bytes; False if its format states none.
 
     Raises:
-        MapFileError: they tell another length.
+        MapFileError: they state another length.
     """
     if is_dat(start):
         dat.check_length(dat.read_header(start), length)
@@ -82,7 +82,7 @@ def _agrees(start: bytes, length: int) -> bool:
 
 
 def _read(path: Path) -> bytes:
-    """The whole file, once what its first bytes promise agrees with its length."""
+    """Read the whole file, after its length was compared with the length that its first bytes state."""
     with open(path, "rb", opener=_open_without_waiting) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
@@ -100,7 +100,7 @@ def _read(path: Path) -> bytes:
 
 
 def _open_without_waiting(path: str, flags: int) -> int:
-    """Opening a named pipe would otherwise wait for its writer."""
+    """Open without blocking: opening a named pipe would otherwise wait for its writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -117,7 +117,7 @@ def _parse(content: bytes, suffix: str, xyz_unit: str | None) -> SurfaceMap:
 
 
 def _parse_datx(content: bytes) -> SurfaceMap:
-    """`datx.parse_datx` in a process that may crash: damaged files do that to the HDF5 library."""
+    """`datx.parse_datx` in a separate process: damaged files can crash the HDF5 library."""
     try:
         answer = read_in_sandbox("datx", content)
     except SandboxError as error:

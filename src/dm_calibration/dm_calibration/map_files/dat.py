@@ -58,7 +58,7 @@ def read_header(content: bytes) -> dict[str, Any]:
     """The header fields by name, of a file that :func:`is_dat`.
 
     Raises:
-        MapFileError: too short, or magic number, format and header size do not belong together.
+        MapFileError: too short, or magic number, format and header size do not match.
     """
     if len(content) < SMALLEST:
         raise MapFileError(f"file length = {len(content)} bytes: a .dat header alone has at least {SMALLEST}")
@@ -73,10 +73,10 @@ def read_header(content: bytes) -> dict[str, Any]:
 
 
 def check_length(header: dict[str, Any], length: int) -> int:
-    """Return the offset of the phase data; the file must be exactly as long as its header says.
+    """Return the offset of the phase data; the file must be exactly as long as its header states.
 
     Raises:
-        MapFileError: the length differs, or the size is absurd.
+        MapFileError: the length differs, or the size of the map is absurd.
     """
     pixels = check_size(header["width"], header["height"])
     intensities = header["intensity_width"] * header["intensity_height"] * header["intensity_buckets"]
@@ -93,7 +93,7 @@ def check_length(header: dict[str, Any], length: int) -> int:
 
 
 def _check_sizes(header: dict[str, Any], intensities: int, pixels: int) -> None:
-    """What the header tells twice about sizes must agree: the format has no checksum. 0 = not known."""
+    """Check that sizes given twice in the header agree, as the format has no checksum. 0 = not known."""
     for name, needed in (("phase_bytes", 4 * pixels), ("intensity_bytes", 2 * intensities)):
         stated = header[name]
         if stated not in (0, needed):
@@ -115,7 +115,7 @@ def parse_dat(content: bytes) -> SurfaceMap:
     """Parse a whole `.dat` file.
 
     Raises:
-        MapFileError: not a whole, meaningful map; the message names the field.
+        MapFileError: not a complete, meaningful map; the message names the field.
     """
     header = read_header(content)
     offset = check_length(header, len(content))

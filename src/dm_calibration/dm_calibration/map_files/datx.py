@@ -28,19 +28,19 @@ from dm_calibration.map_files.surface_map import (
     check_wavelength,
 )
 
-#: Units of length a surface may be stored in, as m. "Fringes" is scaled by the optical factors instead.
+#: Units of length in which a surface may be stored, as m. "Fringes" is scaled by the optical factors instead.
 _LENGTHS = {"nanometers": 1e-9, "micrometers": 1e-6, "millimeters": 1e-3, "meters": 1.0, "angstroms": 1e-10}
 
-#: What a setting that was on or off is stored as.
+#: Texts in which a setting that is on or off is stored.
 _TRUTH = {"0": False, "false": False, "off": False, "1": True, "true": True, "on": True}
 
-#: "No Data" lies far beyond any height; Mx stores the largest double.
+#: Smallest plausible "No Data" value, far beyond any height; Mx stores the largest double.
 _NO_DATA_LEAST = 1e30
 
-#: Rows of /MetaData; real files have some dozens.
+#: Most rows of /MetaData that are accepted; real files have some dozens.
 _LINKS_MAX = 10_000
 
-#: Two witnesses of one value may differ by this much (one is sometimes stored in single precision).
+#: Relative difference allowed between two copies of one value (one is sometimes stored in single precision).
 _AGREEMENT = 1e-6
 
 
@@ -50,12 +50,12 @@ def is_datx(start: bytes) -> bool:
 
 
 def parse_datx(content: bytes) -> SurfaceMap:
-    """Parse a whole `.datx` file, or one of 4Sight.
+    """Parse a whole `.datx` file, or a file of 4Sight.
 
-    The file is read from memory, and links and storage that lead out of it are refused, so nothing outside is touched.
+    The file is read from memory. Links and storage outside the file are refused, so nothing else is accessed.
 
     Raises:
-        MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
+        MapFileError: not a complete, meaningful map; the message names what is missing or wrong.
     """
     try:
         check_end(content, len(content))
@@ -109,7 +109,7 @@ def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
 
 
 def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
-    """Walk Root -> Measurement -> `what` -> Path."""
+    """Follow the links Root -> Measurement -> `what` -> Path."""
     node = "Root"
     for link in ("Measurement", what, "Path"):
         if (node, link) not in metadata:
@@ -119,7 +119,7 @@ def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
 
 
 def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> dict[str, Any]:
-    """Single values that /Attributes/<id> tells, by the last part of each name without the ending ':Value'."""
+    """Scalar attributes of /Attributes/<id>, by the last part of each name without the ending ':Value'."""
     try:
         node = object_at(file, _path(metadata, "Attributes"))
     except MapFileError:  # older files do not list it in /MetaData
@@ -179,7 +179,7 @@ def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
 
 
 def _origin(surface: h5py.Dataset) -> tuple[int, int]:
-    """First two entries of `Coordinates`, the map's corner on the camera; (0, 0) when absent."""
+    """First two entries of `Coordinates`, the position of the map's corner on the camera; (0, 0) if absent."""
     try:
         corner = np.asarray(surface.attrs["Coordinates"]).ravel()[0]
         return (int(corner[0]), int(corner[1]))
@@ -188,7 +188,7 @@ def _origin(surface: h5py.Dataset) -> tuple[int, int]:
 
 
 def _check_witnesses(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> None:
-    """Values that the file tells twice must agree: the format has no checksum."""
+    """Check that values given twice in the file agree, as the format has no checksum."""
     stated = _converter(surface, "Z Converter")
     scale, obliquity = number_in(surface, "Interferometric Scale Factor"), number_in(surface, "Obliquity Factor")
     witnesses: list[tuple[str, float | None, float | None]]
@@ -197,7 +197,7 @@ def _check_witnesses(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
         witnesses += [("Wavelength", wavelength, stated[1])]
         witnesses += [("Interferometric Scale Factor", scale, stated[2]), ("Obliquity Factor", obliquity, stated[3])]
     for name, value, witness in witnesses:
-        if value is None or not witness:  # a witness of 0 says nothing, as everywhere in this format
+        if value is None or not witness:  # 0 means not known, as everywhere in this format
             continue
         if not abs(value - witness) <= _AGREEMENT * abs(value):
             raise MapFileError(f"{surface.name}: {name} = {value:g}, but elsewhere {witness:g}: must agree")

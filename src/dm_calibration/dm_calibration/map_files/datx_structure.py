@@ -1,4 +1,4 @@
-"""The structure of an HDF5 map, checked before memory is claimed for what it promises, and its values."""
+"""The structure of an HDF5 map, checked before the memory that it claims is allocated, and reading of its values."""
 
 import math
 import struct
@@ -12,28 +12,28 @@ from dm_calibration.map_files.surface_map import MapFileError, check_size
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
-#: Where the superblock, by its version, tells the size of addresses and the end of the file (HDF5 format
-#: specification, section II.A).
+#: Byte positions in the superblock, by its version, of the size of addresses and of the end-of-file address (HDF5
+#: format specification, section II.A).
 _SIZE_OF_OFFSETS = {0: 13, 1: 13, 2: 9, 3: 9}
 _END_ADDRESS = {0: 40, 1: 44, 2: 28, 3: 28}
 
-#: Types that heights are stored in; a file whose type description is damaged has another.
+#: Types in which heights are stored; any other type indicates a damaged type description.
 _HEIGHT_TYPES = ("<f8", "<f4", "<i4", "<i2", "<u4", "<u2", "<i8", "<u8")
 
-#: Deflate, the densest filter that Mx uses, cannot shrink data further [bytes per byte].
+#: Largest compression ratio of Deflate, the densest filter that Mx uses [bytes per byte].
 _DENSEST = 1032
 
-#: Smaller values, in any unit, are no heights, by bytes per value: the shortest length in use, 1 pm, is 1e-12 m.
+#: Smallest heights in any unit, by bytes per value, that are accepted: the shortest length in use, 1 pm, is 1e-12 m.
 _LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
 
 _FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
 
 
 def check_end(start: bytes, length: int) -> None:
-    """The superblock, in the first bytes of a file, tells its length; the library minds a shorter file only.
+    """Compare the length of a file with that in its superblock; the HDF5 library only detects shorter files.
 
     Raises:
-        MapFileError: the file is longer or shorter, or has no superblock that can be understood.
+        MapFileError: the file is longer or shorter, or its superblock is missing or of an unknown version.
     """
     version = start[len(SIGNATURE)] if len(start) > 64 else -1
     if version not in _END_ADDRESS:
@@ -48,10 +48,10 @@ def check_end(start: bytes, length: int) -> None:
 
 
 def object_at(file: h5py.File, path: str) -> Any:
-    """The object at `path`, reached through hard links only: others may lead out of the file.
+    """The object at `path`, reached through hard links only: other links may lead out of the file.
 
     Raises:
-        MapFileError: it is missing, or a link elsewhere.
+        MapFileError: it is missing, or reached through another link.
     """
     node: Any = file
     for name in path.strip("/").split("/"):
@@ -65,13 +65,13 @@ def object_at(file: h5py.File, path: str) -> Any:
 
 
 def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.float64]:
-    """(height, width) the values of a map, NaN where there is no data, all of it checked against the whole file.
+    """(height, width) values of a map, NaN = no data, after its storage was checked against the whole file.
 
     Args:
-        no_data: values from this one on are no data; NaN = those that are not finite only.
+        no_data: values from this one upwards mean no data; NaN = only those that are not finite do.
 
     Raises:
-        MapFileError: no table of numbers, or one that does not stand in the file as it is told.
+        MapFileError: not a table of numbers, or one whose storage is not as declared.
     """
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
         raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
@@ -90,10 +90,10 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.flo
 
 
 def _check_storage(surface: h5py.Dataset, length: int) -> None:
-    """Compare what the map promises with what stands in the file of `length` bytes.
+    """Compare the declared size of the map with what is stored in the file of `length` bytes.
 
     Raises:
-        MapFileError: values in another file, or more or fewer than are stored.
+        MapFileError: the values are in another file, or more or fewer than are stored.
     """
     if surface.external or surface.is_virtual:
         raise MapFileError(f"{surface.name}: its values lie in another file, which is not followed")
@@ -117,20 +117,20 @@ def _check_storage(surface: h5py.Dataset, length: int) -> None:
 
 
 def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
-    """The file tells only once where its values stand; a damaged address lets them begin too early or too late.
+    """Check the address of the values, which the file states only once; a damaged one is too low or too high.
 
-    Where the map has corners without data, runs of "No Data" then stand within a row before the place, or behind it.
+    If the map has corners without data, runs of "No Data" are then found within a row before the range, or behind it.
 
     Raises:
-        MapFileError: they do, and not as the values of another dataset.
+        MapFileError: such runs are found, and no other dataset can explain them.
     """
     start = surface.id.get_offset()
-    if start is None or surface.dtype.kind != "f":  # in chunks, or whole numbers, which have no such value
+    if start is None or surface.dtype.kind != "f":  # stored in chunks, or integers, which have no such value
         return
     end, row = start + surface.id.get_storage_size(), surface.shape[1] * surface.dtype.itemsize
     one = np.asarray(no_data, surface.dtype).tobytes()
     for first, last in ((max(0, start - row), start), (end, end + row)):
-        # One alone might be an attribute's value, but none begins right behind the place.
+        # A single one may be the value of an attribute, except directly behind the range, where no attribute begins.
         outside = 2 * one in content[first:last] or (first == end and content[first:last].startswith(one))
         if outside and not _other_values(surface, first, last):
             raise MapFileError(
@@ -139,7 +139,7 @@ def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
 
 
 def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
-    """Whether values of another dataset may stand among the bytes `first` to `last`."""
+    """Whether values of another dataset may lie between the bytes `first` and `last`."""
     found = []
 
     def visit(_name: str, item: object) -> None:
@@ -172,10 +172,10 @@ def _read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
 
 
 def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
-    """Refuse heights that are the file's own bookkeeping: the place of the data has no second witness.
+    """Refuse heights that are the file's own metadata: the address of the data is stored only once.
 
-    A damaged address lets the data begin a little earlier or later, among counts and addresses. As floating-point
-    numbers these are smaller than any height could be.
+    A damaged address moves the start of the data a little, into counts and addresses of the file structure. Read as
+    floating-point numbers these are smaller than any height could be.
     """
     if stored.dtype.kind != "f":
         return
@@ -190,7 +190,7 @@ def missing(where: Any, name: str) -> MapFileError:
 
 
 def number_in(node: Any, name: str) -> float | None:
-    """The number in the attribute `name`; None when it is absent.
+    """The number in the attribute `name`; None if it is absent.
 
     Raises:
         MapFileError: it holds something else.
@@ -204,7 +204,7 @@ def number_in(node: Any, name: str) -> float | None:
 
 
 def required(node: Any, name: str, *otherwise: float | None) -> float:
-    """The number in the attribute `name`, or the first that is known of `otherwise`. Raises MapFileError."""
+    """The number in the attribute `name`, else the first of `otherwise` that is not None. Raises MapFileError."""
     for value in (number_in(node, name), *otherwise):
         if value is not None:
             return value
@@ -214,4 +214,4 @@ def required(node: Any, name: str, *otherwise: float | None) -> float:
 def as_text(value: Any) -> str:
     if isinstance(value, bytes):
         return value.decode("latin-1")
-    return str(value).encode("utf-8", "backslashreplace").decode()  # h5py marks bytes that are no text as surrogates
+    return str(value).encode("utf-8", "backslashreplace").decode()  # h5py decodes invalid bytes as surrogates

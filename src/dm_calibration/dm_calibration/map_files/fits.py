@@ -1,4 +1,4 @@
-"""Maps in FITS files: the primary image, its heights in the unit that BUNIT tells (docs/map-files.md), and writing."""
+"""Maps in FITS files: reading of the primary image, in the unit given by BUNIT (docs/map-files.md), and writing."""
 
 import math
 import re
@@ -21,7 +21,7 @@ from dm_calibration.map_files.surface_map import (
 
 CARD, BLOCK = 80, 2880
 _TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
-#: How programs write the units of `METRES`, beside these themselves and their plurals.
+#: Other names of the units of `METRES` in use, in the singular.
 _SPOKEN = {"meter": "m", "metre": "m", "millimeter": "mm", "micron": "um", "micrometer": "um", "nanometer": "nm"}
 _KEYWORD = re.compile("[A-Z0-9_-]*")
 
@@ -34,13 +34,13 @@ def is_fits(start: bytes) -> bool:
 
 
 def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
-    """Parse the primary image of a whole FITS file; its heights must be surface sag, as they stand.
+    """Parse the primary image of a whole FITS file; its heights must be surface sag.
 
     Args:
-        unit: of the values where there is no BUNIT: m, mm, um, nm or angstrom; None = not known.
+        unit: of the values if there is no BUNIT: m, mm, um, nm or angstrom; None = not known.
 
     Raises:
-        MapFileError: not a whole map with a unit; the message names the keyword.
+        MapFileError: not a complete map with a unit; the message names the keyword.
     """
     header, start = _header(content)
     width, height, kind = _layout(header)
@@ -50,7 +50,7 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
         raise MapFileError(f"file length = {len(content)} bytes: must be {end}, or more by whole blocks of {BLOCK}")
     if any(content[start + size : end]):
         raise MapFileError(f"NAXIS1 x NAXIS2 = {width} x {height}: the values go on behind so many")
-    # The 32-bit words add up to zero in ones' complement.
+    # With a valid CHECKSUM the 32-bit words of the file add up to zero in ones' complement.
     if "CHECKSUM" in header and int(np.frombuffer(content[:end], ">u4").sum(dtype=np.uint64)) % 0xFFFFFFFF:
         raise MapFileError("CHECKSUM does not agree with the content: the file is damaged")
     stored = np.frombuffer(content, kind, width * height, start).reshape(height, width)[::-1]  # row 1 = bottom
@@ -74,7 +74,7 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
 
 
 def fits_bytes(surface: SurfaceMap, instrument: str) -> bytes:
-    """`surface` as a FITS file in m that :func:`parse_fits` reads back."""
+    """`surface` as a FITS file in m, which :func:`parse_fits` can read."""
     height, width = surface.sag.shape
     cards: dict[str, Any] = {"SIMPLE": "T", "BITPIX": -64, "NAXIS": 2, "NAXIS1": width, "NAXIS2": height}
     cards |= {"BUNIT": "'m       '", "WAVELEN": f"{surface.wavelength:.9E}", "PUPLSCAL": f"{surface.pitch or 0.0:.9E}"}
@@ -86,7 +86,7 @@ def fits_bytes(surface: SurfaceMap, instrument: str) -> bytes:
 
 
 def _header(content: bytes) -> tuple[Header, int]:
-    """The values by their keywords, and where the data begin."""
+    """The values by their keywords, and the offset of the data."""
     found: dict[str, Any] = {}
     for at in range(0, len(content) - CARD + 1, CARD):
         card = content[at : at + CARD].decode("latin-1")
@@ -151,7 +151,7 @@ def _unit(text: str, name: str) -> float:
 
 
 def _pitch(header: Header) -> float | None:
-    """m per pixel, from PUPLSCAL or from CDELT with CUNIT in a length; None = not told."""
+    """m per pixel, from PUPLSCAL, or from CDELT if CUNIT is a length; None = not given."""
     if "PUPLSCAL" in header:
         return check_pitch(_real(header, "PUPLSCAL", 0.0))
     if not {"CDELT1", "CDELT2", "CUNIT1", "CUNIT2"} <= header.keys():
@@ -166,7 +166,7 @@ def _pitch(header: Header) -> float | None:
 
 
 def _time(text: str) -> float | None:
-    """s since the epoch, of a DATE-OBS in UTC; None = not told, or no time."""
+    """s since the epoch, of a DATE-OBS in UTC; None = not given, or without a time of day."""
     try:
         return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp() if "T" in text else None
     except ValueError:

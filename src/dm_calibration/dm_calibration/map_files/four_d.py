@@ -17,9 +17,9 @@ from dm_calibration.map_files.surface_map import (
     check_wavelength,
 )
 
-#: The groups by which files are known: of version 2 (.h5), and of newer ones (.4D).
+#: The groups by which files are recognised: of version 2 (.h5), and of newer ones (.4D).
 _OLD, _NEW = "measurement0", "Measurement"
-#: What stands where there is no data: the largest single-precision number; in newer versions what is not finite.
+#: Value of pixels without data: the largest single-precision number; newer versions use values that are not finite.
 _NO_DATA = float(np.finfo(np.float32).max)
 _WAVELENGTH, _COUNT = "WavelengthInNanometers", "NumOfMeasurements"
 
@@ -30,10 +30,10 @@ def is_four_d(file: h5py.File) -> bool:
 
 
 def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
-    """Parse an open file; heights are waves, with the wedge factor that the instrument was set to.
+    """Parse an open file; its heights are in waves and include the wedge factor that was set in the instrument.
 
     Raises:
-        MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
+        MapFileError: not a complete, meaningful map; the message names what is missing or wrong.
     """
     if _OLD not in file:
         return _newer(file, content)
@@ -59,7 +59,7 @@ def _surface_map(waves: NDArray[np.float64], wavelength: float, pitch: float | N
 
 
 def _length(group: Any, name: str) -> float:
-    """m, of an attribute such as "632.8 nm"."""
+    """m, from an attribute such as "632.8 nm"."""
     if name not in group.attrs:
         raise missing(group, name)
     text = as_text(np.asarray(group.attrs[name]).ravel()[0])

@@ -1,4 +1,4 @@
-"""The helper that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Requests come on standard input."""
+"""The helper process that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Reads requests from stdin."""
 
 import math
 import os
@@ -17,14 +17,14 @@ from dm_calibration.map_files.surface_map import MAX_PIXELS, MapFileError
 from dm_calibration.store.hdf5_image import ImageError, parse_image
 from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, receive, send
 
-#: Address space beyond what the process has at its start and the file itself: the largest map, and a copy in work.
+#: Address space on top of that at the start and that of the file, bytes: the largest map, and a working copy.
 MEMORY = 3 * 8 * MAX_PIXELS
 
 Found = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 def datx(content: bytes) -> Found:
-    """A map: its fields, and "sag"."""
+    """A map: its fields as facts, and the array "sag"."""
     found = parse_datx(content)
     facts = {
         item.name: getattr(found, item.name) for item in fields(found) if item.name not in ("sag", "content", "file")
@@ -33,7 +33,7 @@ def datx(content: bytes) -> Found:
 
 
 def image(content: bytes) -> Found:
-    """Columns and attributes of a file; columns of texts are facts, as attributes are."""
+    """Columns and attributes of a calibration file; columns of texts and attributes are returned as facts."""
     columns, attributes = parse_image(content)
     texts = {name: value for name, value in columns.items() if isinstance(value, tuple)}
     arrays = {name: value for name, value in columns.items() if not isinstance(value, tuple)}
@@ -44,7 +44,7 @@ TASKS: dict[str, Callable[[bytes], Found]] = {"datx": datx, "image": image}
 
 
 def limit(length: int) -> None:
-    """Bound what the next file of `length` bytes may cost. The limits only ever end this process."""
+    """Limit computing time and memory for the next file of `length` bytes. Exceeding a limit ends only this process."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = math.ceil(used.ru_utime + used.ru_stime + CPU_BASE_S + length * CPU_PER_BYTE_S)
     _lower(resource.RLIMIT_CPU, seconds)

@@ -1,4 +1,4 @@
-"""A measured surface map, as every reader of this package returns it, and the checks they share."""
+"""A measured surface map, as every reader of this package returns it, and checks that the readers share."""
 
 import hashlib
 import math
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 
-#: Counts from here up mean "no data" (MetroPro reference, phase data matrix).
+#: Counts of this value and above mean "no data" (MetroPro reference, phase data matrix).
 INVALID_COUNTS = 2147483640
 
 #: Counts per fringe by phase resolution code.
@@ -22,16 +22,16 @@ COUNTS_PER_FRINGE = {0: 4096, 1: 32768, 2: 131072}
 #: Largest map that is read; the largest cameras of these instruments have 12 million pixels.
 MAX_PIXELS = 2**25
 
-#: Units of length that files name, as m.
+#: Units of length used in files, as m.
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 
 #: Largest height of a map, m: far beyond the range of any interferometer.
 HEIGHT_MAX = 10.0
 
-#: Pitches along x and y may differ by this much before pixels count as not square.
+#: Largest relative difference between the pitches along x and y for which pixels count as square.
 SQUARE_TOLERANCE = 0.01
 
-#: Pixels of one instrument agree so well from map to map, relatively; files keep the pitch in single precision.
+#: Relative tolerance for the pitch of two maps of one instrument; files keep the pitch in single precision.
 PITCH_TOLERANCE = 1e-4
 
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
@@ -57,17 +57,17 @@ class SurfaceMap:
     Attributes:
         sag: (height, width) float64, m of surface sag (not wavefront); row 0 = top, NaN = no data.
         wavelength: m.
-        pitch: m per pixel; None when the file does not know it.
+        pitch: m per pixel; None if the file does not contain it.
         origin: column and row of the map's top left pixel on the camera.
-        format: "dat", "asc", "xyz", "datx", "fits", "h5" or "4D"; "array" or "zernike" of no file.
-        instrument: software and system type, as told by the file.
+        format: "dat", "asc", "xyz", "datx", "fits", "h5" or "4D"; "array" or "zernike" if not from a file.
+        instrument: software and system type, as given in the file.
         serial: serial number of the instrument; "" when not known.
         time_stamp: Unix time of the measurement, s; None when not known.
         system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
-        phase_steps: number of regions that stood whole fringes off and were brought back.
-        file: its path, as text that is UTF-8; "" = none.
-        written_ns: when that was last written, Unix time, ns; 0 = not known.
+        phase_steps: number of regions that were off by whole fringes and were corrected.
+        file: its path, as valid UTF-8; "" = none.
+        written_ns: modification time of the file, Unix time, ns; 0 = not known.
         content: the file's bytes, for :attr:`sha256`.
     """
 
@@ -88,9 +88,9 @@ class SurfaceMap:
 
     @cached_property
     def sha256(self) -> str:
-        """Of the file's bytes, hexadecimal; "" without a file. Found when first asked for: it takes as long as reading.
+        """SHA-256 of the file's bytes, hexadecimal; "" without a file. Computed on first use.
 
-        A record of where a calibration comes from needs it, a map that is only looked at does not.
+        It takes as long as reading the file, and only the record of where a calibration comes from needs it.
         """
         return hashlib.sha256(self.content).hexdigest() if self.content else ""
 
@@ -101,12 +101,12 @@ class SurfaceMap:
 
     @cached_property
     def pv(self) -> float:
-        """m, peak to valley of `sag` over all its valid pixels; found when first asked for, as `rms`."""
+        """Peak to valley of `sag` over all its valid pixels, m; computed on first use, as `rms`."""
         return float(np.ptp(self.sag[self.valid]))
 
     @cached_property
     def rms(self) -> float:
-        """m, standard deviation of the same."""
+        """Standard deviation of `sag` over all its valid pixels, m."""
         return float(np.std(self.sag[self.valid]))
 
 
@@ -123,7 +123,7 @@ def check_wavelength(wavelength: float) -> float:
 
 
 def check_factor(name: str, value: float) -> float:
-    """Return an interferometric scale or obliquity factor or raise MapFileError; both are of the order of one."""
+    """Return an interferometric scale or obliquity factor, or raise MapFileError; both are of the order of 1."""
     if not 0.01 <= value <= 100:
         raise _outside(name, f"{value:g}", "0.01 to 100")
     return value
@@ -152,8 +152,8 @@ def check_heights(sag: Floats) -> None:
     """Check heights, m, NaN = no data.
 
     Raises:
-        MapFileError: no surface in front of an interferometer has such.
-        NoValidPixelsError: there is none.
+        MapFileError: larger than any surface in front of an interferometer.
+        NoValidPixelsError: there is no valid pixel.
     """
     lowest, highest = float(np.fmin.reduce(sag, axis=None)), float(np.fmax.reduce(sag, axis=None))
     if math.isnan(lowest):
@@ -163,7 +163,7 @@ def check_heights(sag: Floats) -> None:
 
 
 def sag_per_count(header: Mapping[str, Any]) -> float:
-    """Return m of surface sag per count, by the header of a ZYGO file: S O W / R, negative when the data are inverted.
+    """Return m of surface sag per count from the header of a ZYGO file: S O W / R, negative if the data are inverted.
 
     The interferometric scale factor S already turns double-pass fringes into surface height.
 
@@ -182,7 +182,7 @@ def sag_per_count(header: Mapping[str, Any]) -> float:
 
 
 def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str) -> SurfaceMap:
-    """`sag`, m, as a map with what the header of a ZYGO file of the format `form` tells. Raises MapFileError."""
+    """`sag`, m, as a map with the header data of a ZYGO file of the format `form`. Raises MapFileError."""
     return SurfaceMap(
         sag=sag,
         wavelength=header["wavelength"],

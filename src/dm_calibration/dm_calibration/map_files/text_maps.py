@@ -1,6 +1,6 @@
 """ZYGO's text formats `.asc` and `.xyz`, which share fourteen header lines (docs/map-files.md).
 
-Fields are found by line number and position: quotes around texts can be damaged in real files.
+Fields are found by line number and position, as quotes around texts can be damaged in real files.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ XYZ_TITLE = b"Zygo XYZ Data File"
 LINES = 14
 _LONGEST_NUMBER = 40  # characters; bounds the memory that one absurd token can claim
 
-#: Header line and position in it, both from 1, type, and what messages call the field.
+#: For each field: header line and position in it (both counted from 1), type, and the name used in messages.
 _FIELDS: dict[str, tuple[int, int, type, str]] = {
     "time_stamp": (8, 8, int, "time stamp"),
     "intensity_width": (3, 3, int, "intensity width"),
@@ -80,11 +80,11 @@ def numbers(text: bytes, name: str, expected: int, dtype: type) -> NDArray[Any]:
     """Return the whitespace-separated numbers of `text`, exactly `expected` of them.
 
     Raises:
-        MapFileError: another count, or something that is no number.
+        MapFileError: another count, or a text that is not a number.
     """
     if 2 * expected > len(text) + 1:  # a number takes a digit and a separator
         raise MapFileError(f"{name}: {len(text)} characters cannot hold {expected} values; the file is truncated")
-    tokens = text.split(None, expected)  # more would claim twenty times the memory that the file takes
+    tokens = text.split(None, expected)  # splitting further would take twenty times the memory of the file
     if len(tokens) != expected:
         many = f"more than {expected}" if len(tokens) > expected else len(tokens)
         raise MapFileError(f"{name}: {many} values, must be {expected}")
@@ -115,7 +115,7 @@ def parse_asc(content: bytes) -> SurfaceMap:
     """Parse a whole `.asc` file ("Zygo ASCII Data File - Format 2").
 
     Raises:
-        MapFileError: not a whole, meaningful map; the message names the field.
+        MapFileError: not a complete, meaningful map; the message names the field.
     """
     header, body = read_header(content)
     pixels = check_size(header["width"], header["height"])
@@ -134,10 +134,10 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
     """Parse a whole `.xyz` file: after the header one line `column row value` per pixel.
 
     Args:
-        unit: of the value column, one of XYZ_UNITS. The file does not tell it and nothing can guess it.
+        unit: of the value column, one of XYZ_UNITS; the file does not contain it, and it cannot be inferred.
 
     Raises:
-        MapFileError: no unit given, or not a whole, meaningful map; the message names the field.
+        MapFileError: no unit given, or not a complete, meaningful map; the message names the field.
     """
     if unit not in XYZ_UNITS:
         what = "not given" if not unit else f"{unit!r}"
@@ -169,7 +169,7 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
 
 
 def _grid_indices(position: NDArray[np.float64], origin: int, size: int, name: str) -> NDArray[np.intp]:
-    """Map indices from column or row numbers, which count from the camera's corner or from the map's."""
+    """Map indices from column or row numbers, which are counted from the corner of the camera or of the map."""
     first, last = position.min(), position.max()
     for start in (origin, 0):
         if first == start and last == start + size - 1 and (position == np.rint(position)).all():

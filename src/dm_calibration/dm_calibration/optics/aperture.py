@@ -9,13 +9,13 @@ from scipy import ndimage
 
 from dm_common.errors import CodedError, ErrorCode
 
-#: Scatter of the rim about the fitted circle, relative to its radius, up to which the region counts as a disc.
+#: Largest scatter of the rim about the fitted circle, relative to its radius, for which the region counts as a disc.
 _ROUND = 0.02
 
-#: A second region of valid pixels of more than this share of the largest may be the mirror as well.
+#: A second region of valid pixels larger than this share of the largest one may be the mirror as well.
 SECOND_SHARE = 0.3
 
-#: How both refusals end.
+#: End of the messages for both cases.
 _SECOND_MIRROR = "is another mirror in view? Mask it, or tell which one by aperture.radius and aperture.centre_*"
 
 #: Fewest rim points for a circle fit.
@@ -23,13 +23,13 @@ _FEWEST_RIM_POINTS = 16
 
 
 class InsufficientDataError(CodedError):
-    """Too few valid pixels for what is asked; the message has the figures."""
+    """Too few valid pixels for the request; the message gives the numbers."""
 
     error_code = ErrorCode.MAP_INSUFFICIENT
 
 
 class MapRejectedError(CodedError):
-    """A readable map that does not belong to this bench, or whose phase steps cannot be mended."""
+    """A readable map that does not belong to this bench, or whose phase steps cannot be corrected."""
 
     error_code = ErrorCode.MAP_REJECTED
 
@@ -55,11 +55,11 @@ class Aperture:
         return x**2 <= self.radius_px**2 - y[:, None] ** 2
 
     def places(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.complex128]:
-        """x + iy of pixels, y up, in units of the radius."""
+        """x + iy of pixels relative to the centre, y up, in units of the radius."""
         return np.asarray((columns - self.centre_x_px + 1j * (self.centre_y_px - rows)) / self.radius_px)
 
     def pixels(self) -> int:
-        """Number of pixel centres inside or on the circle, counted also where the circle leaves the map."""
+        """Number of pixel centres inside or on the circle, including those outside the map."""
         rows = np.arange(
             math.ceil(self.centre_y_px - self.radius_px), math.floor(self.centre_y_px + self.radius_px) + 1
         )
@@ -82,29 +82,29 @@ def configured_aperture(
 def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
     """Find the aperture that the valid pixels fill.
 
-    The largest connected region of valid pixels, its holes filled, is taken for the mirror. A circle is fitted to its
-    rim (halfway between valid and invalid neighbours) with a loss that dropouts and bumps at the rim cannot pull; where
-    the map's border cuts the region off there is no rim. A region that is not round (a rectangular field, say) gets
-    its largest inscribed circle instead.
+    The largest connected region of valid pixels, with its holes filled, is taken as the mirror. A circle is fitted to
+    its rim (halfway between valid and invalid neighbours) with a robust loss, so that dropouts and bumps at the rim do
+    not bias it; where the border of the map cuts off the region there is no rim. If the region is not round (a
+    rectangular field, say), its largest inscribed circle is taken instead.
 
     Args:
         valid: (height, width), True where there is data.
 
     Raises:
-        InsufficientDataError: no valid pixels to speak of, or two regions of like size, also where they touch.
+        InsufficientDataError: hardly any valid pixels, or two regions of similar size, even if they touch.
     """
     region = _filled_largest_region(valid)
     x, y = _rim(region)
     if len(x) >= _FEWEST_RIM_POINTS:
         circle, scatter = _fit_circle(x, y)
-        far = circle.radius_px > math.hypot(*region.shape)  # a slanted edge, which is no rim
+        far = circle.radius_px > math.hypot(*region.shape)  # the rim of a slanted straight edge, not of a circle
         if not far and scatter <= _ROUND * circle.radius_px:
             disc = circle.disc(region.shape)
-            # It covers about the same pixels.
+            # Circle and region cover about the same pixels.
             if np.count_nonzero(disc & region) >= 0.8 * np.count_nonzero(disc | region):
                 return circle
     circle = _inscribed_circle(region)
-    if region[[0, -1]].any() or region[:, [0, -1]].any():  # cut off there, as a rectangular field is
+    if region[[0, -1]].any() or region[:, [0, -1]].any():  # cut off at the border, such as a rectangular field
         return circle
     other = _inscribed_circle(region & ~circle.disc(region.shape))
     if other.radius_px > max(1.0, math.sqrt(SECOND_SHARE) * circle.radius_px):
@@ -125,7 +125,7 @@ def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if second > SECOND_SHARE * largest:
         raise InsufficientDataError(f"the map shows two regions of {largest} and {second} pixels: {_SECOND_MIRROR}")
     region = labels == sizes.argmax()
-    # Holes are the parts outside the region that do not touch the border; much quicker than binary_fill_holes.
+    # Holes are the parts outside the region that do not touch the border; much faster than binary_fill_holes.
     gaps, _count = ndimage.label(np.pad(~region, 1, constant_values=True))
     return gaps[1:-1, 1:-1] != gaps[0, 0]
 
@@ -142,10 +142,10 @@ def _rim(region: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Aperture, float]:
     """Robust circle through points, and the scatter of the points about it (median absolute distance, pixels)."""
-    from scipy import optimize  # here: a node whose aperture is configured starts without it
+    from scipy import optimize  # imported here: a node with a configured aperture starts without it
 
-    # Algebraic fit (Kasa) as the start, then geometric distances under a loss that flattens first beyond 5 % of the
-    # radius, then beyond one pixel.
+    # Start with an algebraic fit (Kasa), then minimise geometric distances with a loss that flattens beyond 5 % of the
+    # radius at first, then beyond one pixel.
     centre = np.array([x.mean(), y.mean()])
     dx, dy = x - centre[0], y - centre[1]
     a, b, c = np.linalg.lstsq(np.column_stack([2 * dx, 2 * dy, np.ones_like(dx)]), dx**2 + dy**2, rcond=None)[0]
@@ -162,10 +162,10 @@ def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Apertur
 def _inscribed_circle(region: NDArray[np.bool_]) -> Aperture:
     distance = ndimage.distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
     radius = distance.max()
-    # A rectangle has a whole line of best centres: take their middle.
+    # In a rectangle all centres on a line are equally good: take the middle of the line.
     rows, columns = np.nonzero(distance >= radius - 0.5)
     row, column = rows.mean(), columns.mean()
-    if distance[round(row), round(column)] < radius - 1:  # several separate best places
+    if distance[round(row), round(column)] < radius - 1:  # several separate maxima
         row, column = np.unravel_index(distance.argmax(), distance.shape)
-    # The distance reaches to the centre of the first pixel outside; the rim lies half a pixel before it.
+    # The distance is to the centre of the first pixel outside; the rim is half a pixel closer.
     return Aperture(float(column), float(row), float(max(distance[round(row), round(column)] - 0.5, 0.5)))

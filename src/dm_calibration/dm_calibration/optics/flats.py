@@ -1,9 +1,9 @@
 """The error of an instrument from maps of flats against each other: three-flat test, rotation test, or any mixture.
 
-A map shows the flat in the instrument (as it is seen from behind) plus the part in front of it, which is a mirror image
-of itself in the instrument and may be turned. In Zernike terms, Re(c (x + iy)^m P), a turn by a multiplies the complex
+A map shows the flat in the instrument (as it is seen from behind) plus the part in front of it, which appears mirrored
+in the instrument and may be turned. In Zernike terms, Re(c (x + iy)^m P), a turn by a multiplies the complex
 coefficient c of the part by exp(-ima), and the mirror image is (-1)^m times its conjugate. So for each angular order m
-the maps are one small set of linear equations for the flats; what they leave open is told, and left out.
+the maps are one small set of linear equations for the flats. Orders that they leave open are reported and left out.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from dm_calibration.optics.aperture import InsufficientDataError, find_aperture
 from dm_common import Floats
 from dm_common.optics.zernike import MAX_ORDER
 
-#: Highest radial order of the flats' errors that is found.
+#: Highest radial order of the flats' errors that is fitted.
 ORDER = 12
-#: Pixels that the terms are fitted to, about.
+#: Approximate number of pixels to which the terms are fitted.
 FITTED = 20_000
-#: Fewest pixels for each term: with less, noise and what the terms do not hold go into them, and no bound tells.
+#: Fewest pixels per term: with fewer, noise and higher orders leak into the terms, and no bound shows it.
 PIXELS_A_TERM = 4
-#: Directions of the equations weaker than this are left open by the maps: turns that are almost alike.
+#: Singular values, relative to the largest, below which the maps do not determine a direction: turns almost alike.
 DETERMINED = 0.1
-#: Standard deviations that the largest error of the 18 coefficients of a calibration stays within in 95 % of cases.
+#: Bound, in standard deviations, that the largest error of the 18 coefficients of a calibration keeps in 95 % of cases.
 LARGEST_SIGMAS = 3.0
 
 
@@ -35,8 +35,8 @@ class FlatTest:
     Attributes:
         sag: (height, width) m.
         reference: name of the flat in the instrument.
-        part: name of the one in front of it.
-        turn: of the part, counter-clockwise as the camera sees it, rad.
+        part: name of the flat in front of it.
+        turn: rotation of the part, counter-clockwise as the camera sees it, rad.
     """
 
     sag: Floats
@@ -47,13 +47,13 @@ class FlatTest:
 
 @dataclass(frozen=True)
 class FlatError:
-    """The error of the flat that is the reference of the first test.
+    """The error of the instrument's flat, that is, of the reference of the first test.
 
     Attributes:
         sag: (height, width) m, as the instrument shows it; NaN outside the aperture.
-        bound: m, 95 % bound on the largest error of its coefficients; NaN where the maps do not check each other.
-        left: m rms, what the maps say beyond it and the other flats, up to the order.
-        open_orders: angular orders that the maps do not tell, and which are left out.
+        bound: m, 95 % bound on the largest error of its coefficients; NaN if the maps are not redundant.
+        left: m rms, residual of the maps up to the order, after fitting all flats.
+        open_orders: angular orders that the maps do not determine; they are left out.
     """
 
     sag: Floats
@@ -63,10 +63,10 @@ class FlatError:
 
 
 def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
-    """Separate the instrument's flat from the parts.
+    """Separate the error of the instrument's flat from those of the parts.
 
     Raises:
-        ValueError: no tests, maps of different sizes, or maps in which every angular order is left open.
+        ValueError: no tests, maps of different sizes, or maps that determine no angular order.
         InsufficientDataError: the maps share no aperture, or too few of its pixels for the terms.
     """
     if len({test.sag.shape for test in tests}) != 1:
@@ -96,16 +96,16 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     freedom = 0
     open_orders: set[int] = set()
     for (n, m), coefficients in zip(orders, seen, strict=True):
-        if n < 2:  # piston and tilt are those of the mounts
+        if n < 2:  # piston and tilt depend on the mounts
             continue
         matrix = _equations(tests, flats, m)
         inverse = np.linalg.pinv(matrix, rcond=DETERMINED)
-        resolved = inverse @ matrix  # a projection, whose trace is the rank
+        resolved = inverse @ matrix  # a projection; its trace is the rank
         determined = np.isclose(np.diag(resolved), 1.0)[: 2 if m else 1]
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
         squares += apart / ((n + 1) * (2 if m else 1))  # mean square over the disc
-        if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
+        if n <= MAX_ORDER:  # the bound holds for these; retrace error and vibration affect them more than higher orders
             judged += apart
             freedom += (2 if m else 1) * len(tests) - round(np.trace(resolved))
         worst = max(worst, *np.linalg.norm(inverse[: len(determined)], axis=1)[determined], 0.0)
@@ -121,14 +121,14 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
 
 
 def _term(place: NDArray[np.complex128], n: int, m: int) -> NDArray[np.complex128]:
-    """The Zernike term of radial order n and angular order m, 1 at the edge: its real part is the cosine."""
+    """The Zernike term of radial order n and angular order m, 1 at the edge; its real part is the cosine term."""
     from scipy.special import eval_jacobi
 
     return np.asarray(eval_jacobi((n - m) // 2, 0, m, 2.0 * np.abs(place) ** 2 - 1.0) * place**m)
 
 
 def _equations(tests: Sequence[FlatTest], flats: Sequence[str], m: int) -> Floats:
-    """(2 T, 2 F): real and imaginary coefficient of each map, from those of each flat as seen in the instrument."""
+    """(2 T, 2 F): real and imaginary coefficients of each map from those of each flat as seen in the instrument."""
     matrix = np.zeros((2 * len(tests), 2 * len(flats)))
     for number, test in enumerate(tests):
         at, part = slice(2 * number, 2 * number + 2), 2 * flats.index(test.part)
@@ -137,4 +137,4 @@ def _equations(tests: Sequence[FlatTest], flats: Sequence[str], m: int) -> Float
         cosine, sine = np.cos(m * test.turn), np.sin(m * test.turn)
         turned = np.array([[cosine, sine], [-sine, cosine]]) @ np.diag((1.0, -1.0))
         matrix[at, part : part + 2] += (-1) ** m * turned
-    return matrix if m else matrix * np.tile((1.0, 0.0), len(flats))  # nothing turns: no sines
+    return matrix if m else matrix * np.tile((1.0, 0.0), len(flats))  # m = 0: rotation has no effect, no sine terms

@@ -1,7 +1,7 @@
-"""Errors of the instrument that change from map to map or place to place: retrace error and radial distortion.
+"""Errors of the instrument that depend on tilt or position: retrace error and radial distortion.
 
-Both are taken off a map as the camera shows it, in coordinates of the camera: from the centre of the map, y up, in
-units of half its longer side.
+Both are corrected in the map as the camera shows it, in camera coordinates: from the centre of the map, y up, in units
+of half its longer side.
 """
 
 from collections.abc import Sequence
@@ -16,38 +16,38 @@ from dm_common import Floats
 from dm_common.optics.piston_tilt import fit_plane
 from dm_common.optics.zernike import MAX_ORDER, PISTON_TILT, TERMS
 
-#: Numbers of a retrace error: the terms beyond tilt for a tilt in x, then in y.
+#: Number of retrace coefficients: the terms beyond tilt for a tilt in x, then for a tilt in y.
 RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)
-#: Tilts that retrace error is found from must differ by this much in each direction, m at the edge.
+#: Least spread, in each direction, of the tilts from which retrace error is found, m at the edge.
 TILT_MIN = 1e-7
-#: Coefficients of maps of one shape differ by no more than this once their retrace error is taken off, m.
+#: Largest difference of a coefficient between maps of one shape after correction of their retrace error, m.
 LEFT_MAX = 3e-8
-#: Nor by more than this share of what they differed by before, where that is not the noise of maps (m).
+#: Largest share of that difference before correction that may remain; the limit is never below the noise of maps, m.
 LEFT_SHARE, LEFT_NOISE = 0.3, 3e-9
-#: Fewest maps, and fewest points of a grid, that leave something to judge the result by.
+#: Fewest maps, and fewest points of a grid: enough to leave residuals by which the result can be judged.
 MAPS_MIN, POINTS_MIN = 5, 8
 
 
 def _axes(shape: tuple[int, ...]) -> tuple[Floats, Floats, float]:
-    """x of the columns and y of the rows, and the pixels of half the longer side."""
+    """x of the columns, y of the rows, and half the longer side in pixels."""
     half = 0.5 * max(shape)
     y, x = (np.asarray(np.arange(size) - 0.5 * (size - 1), dtype=np.float64) / half for size in shape)
     return x, -y, half
 
 
 def _tilt(sag: Floats) -> Floats:
-    """(2,) m that the edge of the camera stands off by tilt, in x and y."""
+    """(2,) m, sag at the edge of the camera due to tilt, in x and y."""
     _, in_columns, in_rows = fit_plane(sag)
     return np.array((in_columns, -in_rows)) * 0.5 * max(sag.shape)
 
 
 def without_retrace(sag: Floats, retrace: ArrayLike) -> Floats:
-    """(height, width) m, less the error that goes with the tilt of this map.
+    """(height, width) m, the map less the error that is proportional to its tilt.
 
     Args:
-        retrace: (36,) coefficients of the 18 terms beyond tilt for each m of edge sag by tilt in x, then in y.
+        retrace: (36,) coefficients of the 18 terms beyond tilt per m of sag at the edge by tilt in x, then in y.
     """
-    if not np.isfinite(sag).any():  # nothing tells the tilt, and nothing is to be corrected
+    if not np.isfinite(sag).any():  # no data, no tilt
         return sag
     x, y, _ = _axes(sag.shape)
     added = np.zeros(len(TERMS))
@@ -60,8 +60,8 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
     """Retrace error from maps (height, width), m, of one shape under different tilts.
 
     Returns:
-        The (36,) numbers of :func:`without_retrace`, and by how much a coefficient of these maps is off their mean at
-        most, m: as they are, and without the retrace error.
+        The (36,) numbers of :func:`without_retrace`, and the largest deviation of a coefficient, m: from the mean of
+        the maps, and after correction.
 
     Raises:
         ValueError: too few maps, maps of different sizes or shapes, or tilts that do not differ in both directions.
@@ -95,10 +95,10 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
 
 
 def undistorted(sag: Floats, distortion: float) -> Floats:
-    """(height, width) with everything where it is: what lies at the edge was seen further out by the share `distortion`
-    of its distance to the centre, other places by its square times that. Linear between pixels, NaN where any is.
+    """(height, width) without radial distortion: at the distance r from the centre (1 at the edge) points were seen
+    further out by the share `distortion` * r**2. Linear between pixels, NaN where any of these is.
     """
-    from scipy import ndimage  # here: most benches need no correction
+    from scipy import ndimage  # imported here: most benches need no correction
 
     x, y, half = _axes(sag.shape)
     stretch = 1.0 + distortion * np.add.outer(y**2, x**2)
@@ -110,8 +110,8 @@ def undistorted(sag: Floats, distortion: float) -> Floats:
 
 @dataclass(frozen=True)
 class LateralScale:
-    """What a grid says of an instrument: m per pixel at the centre of the map, radial distortion as a share at its
-    edge, 95 % bounds on the relative error of the first and on that of the other, and rms distance left, m.
+    """Result of a grid: m per pixel at the centre of the map, distortion at its edge as a share of the distance, 95 %
+    bounds on the relative error of the pitch and on the error of the distortion, and rms distance left, m.
     """
 
     pitch: float
@@ -140,7 +140,7 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     )
     if len(seen) < POINTS_MIN or min(ranks) < 3:
         raise ValueError(f"{len(seen)} marks: must be {POINTS_MIN} or more, and not all on one line")
-    fits = [_similarity(seen, place) for place in (x + 1j * y, -x + 1j * y)]  # the camera may show a mirror image
+    fits = [_similarity(seen, place) for place in (x + 1j * y, -x + 1j * y)]  # the camera may show it mirrored
     values, covariance, left = min(fits, key=lambda fit: fit[2])
     size = float(np.hypot(values[0], values[1]))
     along = values[:2] / size
@@ -149,8 +149,8 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
 
 
 def _similarity(seen: NDArray[np.complex128], place: NDArray[np.complex128]) -> tuple[Floats, Floats, float]:
-    """(5,) scale as a complex number, shift and distortion that take `place` to what is seen, their covariance, and the
-    rms distance left.
+    """(5,) complex scale, complex shift and distortion that map `seen` (camera coordinates) to `place` (m), their
+    covariance, and the rms distance left, m.
     """
     from scipy.optimize import least_squares
 

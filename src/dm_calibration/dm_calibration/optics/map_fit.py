@@ -26,10 +26,10 @@ _PRODUCTS = [(a, b) for a in range(MAX_ORDER + 1) for b in range(MAX_ORDER + 1 -
 _A = np.array([a for a, _b in _PRODUCTS])
 _B = np.array([b for _a, b in _PRODUCTS])
 
-#: Smallest over largest eigenvalue of the normalised Gram matrix below which the pixels cannot tell the terms apart.
+#: Ratio of the extreme eigenvalues of the normalised Gram matrix below which the pixels do not determine the terms.
 _SINGULAR = 1e-8
 
-#: Share of the map's energy below which the residual is computed pixel by pixel: the difference of two large sums
+#: Share of the map's energy below which the residual is computed pixel by pixel: as the difference of two large sums it
 #: would have lost its digits.
 _CANCELLATION = 1e-8
 
@@ -42,7 +42,7 @@ class MapFit:
         coefficients: (21,), Born & Wolf.
         sigma: (21,), one standard deviation each, estimated from the residual as if it were independent from pixel to
             pixel. Print-through and air turbulence are correlated, so the true uncertainty is larger.
-        residual_rms: what the terms leave unexplained over the valid pixels.
+        residual_rms: rms over the valid pixels of what the terms leave.
         valid_fraction: valid pixels / pixels inside the aperture.
     """
 
@@ -77,7 +77,7 @@ def _zernike_from_products() -> Floats:
 
 @lru_cache(maxsize=4)
 def _disc(aperture: Aperture, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The aperture's pixels: often the same from map to map where the valid ones are not."""
+    """The aperture's pixels, which often stay the same from map to map where the valid ones change."""
     disc = aperture.disc(shape)
     disc.flags.writeable = False
     return disc
@@ -86,7 +86,7 @@ def _disc(aperture: Aperture, shape: tuple[int, int]) -> NDArray[np.bool_]:
 class MapFitter:
     """Fits maps that share one mask of valid pixels and one aperture.
 
-    Making it costs a few times as much as a fit: keep it as long as the mask repeats. Not for two threads at a time.
+    Creation takes a few times as long as a fit, so keep it as long as the mask repeats. Not thread-safe.
     """
 
     def __init__(self, mask: NDArray[np.bool_], centre_x_px: float, centre_y_px: float, radius_px: float) -> None:
@@ -98,7 +98,7 @@ class MapFitter:
             radius_px: normalisation radius of the terms.
 
         Raises:
-            InsufficientDataError: fewer valid pixels than terms, or so placed that they cannot tell the terms apart.
+            InsufficientDataError: fewer valid pixels than terms, or their positions do not determine the terms.
         """
         self.aperture = Aperture(centre_x_px, centre_y_px, radius_px)
         self._shape = mask.shape
@@ -117,7 +117,7 @@ class MapFitter:
         self._legendre_x = np.ascontiguousarray(legendre.legvander(x, 2 * MAX_ORDER))
         self._legendre_y = np.ascontiguousarray(legendre.legvander(y, 2 * MAX_ORDER))
         self._solve_with(self._gram())
-        # The thin bases of the fit itself: moments[b, a] against P_b(y) P_a(x).
+        # Bases for the fit itself: moments[b, a] is the moment with P_b(y) P_a(x).
         self._thin_x = np.ascontiguousarray(self._legendre_x[:, : MAX_ORDER + 1])
         self._thin_y = np.ascontiguousarray(self._legendre_y[:, : MAX_ORDER + 1])
         self._moments = MaskedMoments(self._used, self._thin_y, self._thin_x)
@@ -133,7 +133,7 @@ class MapFitter:
         return transform @ products @ transform.T
 
     def _solve_with(self, gram: Floats) -> None:
-        scale = TERM_RMS * math.sqrt(self.valid_pixels)  # a full disc gives the unit matrix
+        scale = TERM_RMS * math.sqrt(self.valid_pixels)  # makes the Gram matrix of a full disc the unit matrix
         eigenvalues = np.linalg.eigvalsh(gram / np.outer(scale, scale))
         if eigenvalues[0] < _SINGULAR * eigenvalues[-1]:
             raise InsufficientDataError(
@@ -146,7 +146,7 @@ class MapFitter:
         self._sigma_per_pixel_noise = np.sqrt(np.diag(inverse)) / scale
 
     def fits(self, mask: NDArray[np.bool_], aperture: Aperture) -> bool:
-        """Whether this fitter was made for that aperture and mask (as far as it lies inside the aperture)."""
+        """Whether this fitter was made for this aperture and mask (as far as the mask lies inside the aperture)."""
         if aperture != self.aperture or mask.shape != self._shape:
             return False
         return bool(np.array_equal(mask[self._rows, self._columns] & self._disc, self._used))
@@ -192,5 +192,5 @@ def in_products(coefficients: Floats) -> Floats:
 
 
 def _span(centre: float, radius: float, size: int) -> slice:
-    """Pixels of one axis that the circle reaches."""
+    """The range of pixels along one axis inside the circle."""
     return slice(max(math.ceil(centre - radius), 0), max(min(math.floor(centre + radius) + 1, size), 0))

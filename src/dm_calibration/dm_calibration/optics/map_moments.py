@@ -1,15 +1,15 @@
 """Moments of a map, and of a mask, against products of polynomials: the kernels of the full-map fit.
 
 **Of a map.** With the polynomials of the rows in P (h, d) and of the columns in Q (w, d), all d x d moments of a map Z
-are two thin products, P^T Z Q. What takes time is not the arithmetic but memory: pixels without data must become 0
-first, which costs a copy of the map, and each further pass over the copy costs as much as reading it. So the map is
-taken in blocks of rows that fit in the processor's second-level cache. A block is copied, its unused pixels are set to
-0, and it is summed into the energy and into P^T Z while it is there; main memory is read once and never written. Whole
-rows are copied, also where the aperture fills only part of them, because memory is read ahead only along unbroken runs.
+are two thin products, P^T Z Q. The time is limited by memory access, not by arithmetic: pixels without data must become
+0 first, which costs a copy of the map, and each further pass over the copy costs as much as reading it. So the map is
+taken in blocks of rows that fit in the processor's second-level cache. While a block is in the cache it is copied, its
+unused pixels are set to 0, and it is added to the energy and to P^T Z; main memory is read once and never written.
+Rows are copied as a whole, even if the aperture fills only part of them: prefetching works only on contiguous memory.
 
 **Of a mask.** A row of a mask is a few runs of pixels, and the sum of a polynomial over a run is a difference of two
-running sums. One look-up per end of a run replaces a product over all pixels. Scattered dropouts are runs too; from
-about one pixel in 32 on there are so many that the plain product is quicker.
+cumulative sums. One look-up per end of a run replaces a product over all pixels. Scattered dropouts are runs too; from
+about one pixel in 32 on there are so many runs that the plain product is faster.
 """
 
 import math
@@ -22,17 +22,17 @@ from scipy.sparse import csr_array
 
 from dm_common import Floats
 
-#: Bytes of a block: with what is read meanwhile it fits in a second-level cache of 0.5 to 1 MB.
+#: Bytes of a block: with the data read meanwhile it fits in a second-level cache of 0.5 to 1 MB.
 _BLOCK_BYTES = 384 * 1024
 #: The same for the mask, which shares the cache with little else.
 _MASK_BLOCK_BYTES = 64 * 1024
-#: Pixels per run of a mask below which the plain product is quicker than looking up the ends.
+#: Pixels per run of a mask below which the plain product is faster than looking up the ends of the runs.
 _PIXELS_PER_RUN = 32
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Rows start to stop; unused are the columns left of `first`, those from `last` on, and flat indices between."""
+    """Rows start to stop; unused are columns before `first` and from `last` on, and the flat indices in `unused`."""
 
     start: int
     stop: int
@@ -46,7 +46,7 @@ class MaskedMoments:
     """Moments and energy of maps over the pixels of one mask."""
 
     def __init__(self, mask: NDArray[np.bool_], rows_basis: Floats, columns_basis: Floats) -> None:
-        """Find what to leave out, block by block.
+        """Find the unused pixels of each block.
 
         Args:
             mask: (h, w), True where a pixel counts.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dm_common.values import live_parameter, real, switch
 
-#: Rotations that differ less from a multiple of 90 degrees are one: no pixel of any camera moves by a tenth [degrees].
+#: Deviation from a multiple of 90 degrees that is ignored: it moves no pixel of any camera by a tenth [degrees].
 _EXACT = 1e-3
 
 
@@ -18,7 +18,7 @@ _EXACT = 1e-3
 class Orientation:
     """How the instrument's picture must be turned: first the flips, then the rotation about the map's centre.
 
-    Multiples of 90 degrees move pixels; other rotations interpolate between them.
+    Multiples of 90 degrees permute pixels; other rotations interpolate between them.
     """
 
     flip_x: bool = live_parameter(switch(False), "Exchange left and right of the instrument's picture.")
@@ -31,8 +31,8 @@ class Orientation:
     def apply(self, sag: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the map in the mirror frame, C-contiguous.
 
-        Its centre stays in the centre. A map turned by other than a half turn has another (height, width), so that no
-        data are lost; where there were none it is NaN.
+        The centre is preserved. Except for half turns a rotated map has another (height, width), so that no data are
+        lost; places outside the original map are NaN.
         """
         if self.flip_x:
             sag = sag[:, ::-1]
@@ -42,16 +42,16 @@ class Orientation:
         sag = np.rot90(sag, quarters % 4)
         rest = self.rotate_deg - 90.0 * quarters
         if abs(rest) >= _EXACT:
-            from scipy import ndimage  # here: most benches need no rotation
+            from scipy import ndimage  # imported here: most benches need no rotation
 
-            # Linear between pixels: one has data where its four neighbours had. What the interpolation changes is the
-            # curvature over one pixel: less than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
+            # Linear interpolation: a pixel has data if its four neighbours have. It is wrong by the curvature over one
+            # pixel: less than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
             sag = ndimage.rotate(sag, rest, order=1, cval=np.nan)
         return np.ascontiguousarray(sag, dtype=np.float64)
 
     def after(self, turn: float, mirrored: bool) -> Orientation:
-        """The orientation for a mirror that the maps, as this one has them, show mirrored left to right (or not) and
-        then turned counter-clockwise by `turn`, rad.
+        """The orientation that corrects maps which, with the present one, show the mirror mirrored left to right (if
+        `mirrored`) and then turned counter-clockwise by `turn`, rad.
         """
         rotate = self.rotate_deg - math.degrees(turn)
         if mirrored:  # mirroring after a rotation is rotating the other way after mirroring

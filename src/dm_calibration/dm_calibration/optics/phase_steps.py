@@ -1,7 +1,7 @@
-"""Phase steps: regions of a map that stand whole fringes off, since the instrument lost count there.
+"""Phase steps: regions of a map that are off by whole fringes because the instrument lost count of fringes.
 
-An instrument follows less than half a fringe from pixel to pixel. Where neighbours differ by more a region ends, and
-what it differs from the one beside it tells how many fringes were lost.
+An instrument follows less than half a fringe from pixel to pixel. A larger difference between neighbours is the border
+of a region; the height difference to the adjacent region gives the number of fringes lost.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from scipy import ndimage
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
 
-#: Share of the valid pixels below which a region is a speck.
+#: Smallest region, as a share of the valid pixels; smaller ones are specks.
 SPECK = 1e-3
-#: A step differs from whole fringes by less than this, in fringes.
+#: Largest deviation of a step from whole fringes, in fringes.
 WHOLE = 0.25
-#: Regions further from each other than this, in pixels, say nothing of each other.
+#: Largest distance, in pixels, between regions whose heights are compared.
 GAP = 4.0
 
 
 def mend_phase_steps(sag: Floats, fringe: float) -> tuple[Floats, int]:
-    """The map (height, width), m, with all its regions on the fringes of the largest, and how many stood off.
+    """The map (height, width), m, with all regions on the fringe of the largest, and the number of regions corrected.
 
     Args:
         fringe: m of sag, half a wavelength.
@@ -51,10 +51,10 @@ def mend_phase_steps(sag: Floats, fringe: float) -> tuple[Floats, int]:
                 waiting.append(other)
     fringes = np.zeros(count + 1)
     fringes[list(lost)] = list(lost.values())
-    # What a pixel of no region should be near to.
+    # Corrected height at the nearest pixel of a region: reference for the pixels that belong to none.
     level = sag[tuple(nearest)] - fringe * fringes[labels[tuple(nearest)]]
     off = np.where(labels > 0, fringes[labels], (sag - level) / fringe)
-    near = np.abs(off - np.round(off)) < WHOLE  # not, where there are no data
+    near = np.abs(off - np.round(off)) < WHOLE  # False where there are no data
     mended = sag - fringe * np.where(near, np.round(off), 0.0)
     return mended, int(np.count_nonzero(fringes))
 
@@ -62,13 +62,13 @@ def mend_phase_steps(sag: Floats, fringe: float) -> tuple[Floats, int]:
 def _steps(
     sag: Floats, labels: NDArray[np.int_], nearest: NDArray[np.int_], distance: Floats, fringe: float
 ) -> dict[tuple[int, int], float]:
-    """Median height of a second region above a first, fringes, both ways, of all that lie beside each other.
+    """Median height of one region above another, fringes, for all pairs of adjacent regions in both orders.
 
-    The slope on either side is followed to the other, as far as there is one to be seen.
+    The slope at either side is extrapolated to the other side, as far as it is known.
 
     Args:
-        nearest: (2, height, width), row and column of the pixel of a region that is nearest to each.
-        distance: from it, pixels.
+        nearest: (2, height, width), row and column of the nearest pixel that belongs to a region.
+        distance: to that pixel, pixels.
     """
     owner = labels[tuple(nearest)]
     found: list[tuple[NDArray[np.int_], Floats]] = []
@@ -87,7 +87,7 @@ def _steps(
 
 
 def _slope(sag: Floats, at: NDArray[np.int_], axis: int, way: int, fringe: float) -> Floats:
-    """m per pixel along `axis` at the pixels `at` (2, B), to their neighbour one `way`; 0 where it is of no region."""
+    """m per pixel along `axis` at the pixels `at` (2, B), to the neighbour in direction `way`; 0 across a step."""
     beside = at.copy()
     beside[axis] = np.clip(beside[axis] + way, 0, sag.shape[axis] - 1)
     slope = way * (sag[tuple(beside)] - sag[tuple(at)])
@@ -95,7 +95,7 @@ def _slope(sag: Floats, at: NDArray[np.int_], axis: int, way: int, fringe: float
 
 
 def _whole(fringes: float, middle: Floats) -> int:
-    """`fringes` as a whole number; of a region about `middle`, row and column."""
+    """`fringes` as an integer; `middle`: row and column of the region, for the message of MapRejectedError."""
     if abs(fringes - round(fringes)) >= WHOLE:
         row, column = np.round(middle).astype(int)
         raise MapRejectedError(

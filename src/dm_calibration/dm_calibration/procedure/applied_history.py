@@ -1,4 +1,4 @@
-"""What stood at the mirror when a map was taken, from what the driver reports."""
+"""The shape of the mirror when a map was taken, from the reports of the driver."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import HysteresisObserver, Observed
 from dm_common.mirror import Applied
 
-#: Signals, or effective signals, that differ less, normalised, are the same shape: below 1 nm.
+#: Signals, or effective signals, whose normalised difference is smaller count as the same shape: below 1 nm.
 SMALL_MOVE = 2e-4
 
 
@@ -26,8 +26,8 @@ class SettledState:
     """The mirror at the time of a map.
 
     Attributes:
-        effective: (N,) effective signals; the signals where no hysteresis is followed.
-        since: s, when it took this shape.
+        effective: (N,) effective signals; the signals themselves if no hysteresis is followed.
+        since: time at which the mirror took this shape, s.
     """
 
     effective: Floats
@@ -35,35 +35,35 @@ class SettledState:
 
 
 class AppliedHistory:
-    """The states of late, under one hysteresis model; every method may be called from any thread."""
+    """Recent states of the mirror under one hysteresis model; every method is thread-safe."""
 
     def __init__(self) -> None:
         self._observer = HysteresisObserver()
         self._heard = float("-inf")
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
-        """Follow `law` from now on, and through what was heard before; None = no hysteresis."""
+        """Follow `law` from now on, and apply it to earlier reports as well; None = no hysteresis."""
         self._observer.use(law or HysteresisModel.linear(), middle)
 
     def forget(self) -> None:
-        """Another mirror is there: of its actuators nothing is known."""
+        """Forget all reports: another mirror was connected, whose history is not known."""
         self._observer.recall(None, another=True)
 
     def observe(self, report: Applied) -> None:
         """Take the driver's next report.
 
         Raises:
-            ValueError: as :meth:`HysteresisObserver.observe`; what was heard before is forgotten.
+            ValueError: as :meth:`HysteresisObserver.observe`; earlier reports are forgotten.
         """
         self._observer.observe(report)
-        self._heard = report.heard  # who waits for it in another thread finds it followed
+        self._heard = report.heard  # set last: a thread that waits for it finds the report processed
 
     def heard_since(self, time: float) -> bool:
-        """Whether the driver has reported at or after `time` (s), so that a move until then would be known."""
+        """Whether the driver has reported at or after `time` (s), so that every move before it is known."""
         return self._heard >= time
 
     def still_for(self, time: float) -> float:
-        """How long the mirror has stood in its present shape at `time`, s; 0 = it moves, infinite = no report of it."""
+        """How long the mirror had kept its present shape at `time`, s; 0 = it moves, infinite = no report yet."""
         observed = self._observer.recent()
         if not observed:
             return float("inf")
@@ -72,13 +72,13 @@ class AppliedHistory:
         return time - observed[self._since(observed, len(observed) - 1)].report.time
 
     def settled(self, time: float, still: float) -> SettledState:
-        """What stood at `time` (s), if the mirror kept its shape from `still` (s) before to `still` after.
+        """The state at `time` (s), if the mirror kept its shape from `still` (s) before to `still` after.
 
-        Corrections of a held shape follow from the hysteresis model, and the signals at `time` are known: they are no
-        move.
+        Corrections that hold a shape against creep do not count as a move: their effect follows from the hysteresis
+        model, and the signals at `time` are known.
 
         Raises:
-            MapNotUsableError: it did not, or that is not known, or the hysteresis of the actuators is not known.
+            MapNotUsableError: the mirror moved, or this or the hysteresis of the actuators is not known.
         """
         law, observed = self._observer.law, self._observer.recent()
         times = [seen.report.time for seen in observed]
@@ -109,14 +109,14 @@ class AppliedHistory:
         return SettledState(law.effective(law.advance(estimate.state, time)), since)
 
     def _since(self, observed: Sequence[Observed], at: int) -> int:
-        """Index of the first report from which on the shape of report `at` was kept."""
+        """Index of the first report since which the shape of report `at` was kept."""
         first = at
         while first > 0 and self._keeps(observed[at], observed[first - 1]):
             first -= 1
         return first
 
     def _keeps(self, shape: Observed, seen: Observed) -> bool:
-        """Whether the mirror stood in the shape of a report at another: the same signals, or the same surface."""
+        """Whether the mirror had the shape of report `shape` at report `seen`: same signals, or same surface."""
         law, state, report = self._observer.law, seen.estimate.state, seen.report
         ends = [report.signals]
         if report.moving:

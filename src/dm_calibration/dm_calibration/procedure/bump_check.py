@@ -1,7 +1,7 @@
-"""A mirror that was bumped in the middle of a run, told by its reference frames.
+"""Detection, from its reference frames, of a mirror that was bumped in the middle of a run.
 
-All reference frames show the same command. Between two of them the picture may change by what hysteresis left behind
-and by a little drift; a tilt, a shift on the camera or another figure beyond that is somebody's elbow.
+All reference frames show the same command. Between two of them the map may change by the hysteresis left behind and by
+a little drift; a larger change of tilt, position on the camera or figure means that the mirror was bumped.
 """
 
 import math
@@ -15,10 +15,10 @@ from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_common.values import live_parameter, real
 
-#: An aperture found on a map may wander by so many pixels.
+#: Uncertainty of the place of an aperture that is found on a map, pixels.
 _WANDER_PX = 1.5
-#: Actuators that moved together err together: more than errors of each by its own add up to. A run whose held
-#: shapes alone lean to a bowl in one half and to its inverse in the other left 1.3 to 1.6 times as much.
+#: Factor on the allowance because actuators that moved together err together, which exceeds the rms sum of independent
+#: errors. A run whose held shapes are bowls in one half and inverted bowls in the other left 1.3 to 1.6 times as much.
 _TOGETHER = 2.0
 
 
@@ -27,8 +27,8 @@ class BumpOptions:
     """Largest changes between two reference frames; 0 = not checked.
 
     Attributes:
-        hysteresis_allowance: share of their moves by which actuators may miss their mark; twice that is allowed for,
-            since actuators that moved together err together.
+        hysteresis_allowance: error of actuators as a share of their moves; twice that is allowed for, since actuators
+            that moved together err together.
     """
 
     tilt_max: float = live_parameter(
@@ -51,15 +51,15 @@ class BumpCheck:
     """Compares each reference frame with the one before it."""
 
     def __init__(self, options: BumpOptions, rest: Floats, half_range: float) -> None:
-        """`rest`: (N,) signals of the reference frames; `half_range`: how far a degauss goes from there."""
+        """`rest`: (N,) signals of the reference frames; `half_range`: reach of a degauss from there."""
         self._options, self._rest, self._half_range = options, rest, half_range
         self._last: MapTaken | None = None
         self._moved = np.zeros_like(rest)
-        # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
+        # Sums of squares: change in the maps (rms, m) and commanded change. The root of their ratio is the response.
         self._shown = self._commanded = 0.0
 
     def take(self, taken: MapTaken) -> None:
-        """Take a good map, which later reference frames are compared with."""
+        """Take a good map; later reference frames are compared with it."""
         record = taken.record
         if record.kind == StepKind.REFERENCE:
             self._last = taken
@@ -71,18 +71,18 @@ class BumpCheck:
         self._moved = np.maximum(self._moved, np.abs(away))
         if self._last is not None and np.isfinite(record.coefficients).all():
             self._shown += _figure_rms(record.coefficients - self._last.record.coefficients) ** 2
-            # A common signal lifts the plate without bending it.
+            # A signal common to all actuators lifts the plate without bending it.
             self._commanded += float(np.square(away - away.mean()).sum())
 
     def degaussed(self) -> None:
-        """All actuators went through their whole range."""
+        """Note that all actuators went through their whole range."""
         self._moved = np.maximum(self._moved, self._half_range)
 
     def change(self, frame: MapTaken, interrupted: bool) -> str:
-        """How the reference frame `frame` differs from the one before it; "" = as it should.
+        """How the reference frame `frame` differs from the one before it; "" = within the allowed changes.
 
         Args:
-            interrupted: somebody may have aligned the instrument since; a tilt does not matter then.
+            interrupted: the run was interrupted, so the instrument may have been realigned; tilt is not checked.
         """
         if self._last is None:
             return ""
@@ -116,7 +116,7 @@ class BumpCheck:
         if not self._moved.any():
             return 0.0
         if not self._commanded:
-            return float("inf")  # no map yet tells how large a response is
+            return float("inf")  # no map yet shows the size of the response
         response = np.sqrt(self._shown / self._commanded)
         return float(_TOGETHER * self._options.hysteresis_allowance * response * np.linalg.norm(self._moved))
 

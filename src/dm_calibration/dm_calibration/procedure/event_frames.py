@@ -1,7 +1,7 @@
-"""Events of a run as bytes, each sealed with a hash, so that a torn or damaged one is known as such.
+"""Events of a run as bytes, each sealed with a hash, so that torn or damaged ones are detected.
 
-A frame is a mark, two lengths, a head in JSON, the raw bytes of the arrays and a SHA-256. The hash goes over the hash
-of the frame before it as well: no frame can get lost between two others, or be put in from another run.
+A frame is a mark, two lengths, a head in JSON, the raw bytes of the arrays and a SHA-256. The hash includes the hash of
+the frame before it: no frame can get lost between two others, or be inserted from another run.
 """
 
 import hashlib
@@ -21,13 +21,13 @@ from dm_common.optics.sampling import SamplePoints
 _MARK = b"DMJ1"
 _LENGTHS = struct.Struct("<II")
 _SEAL = hashlib.sha256().digest_size
-#: Larger heads or payloads are not of this suite [bytes].
+#: Largest head or payload that is accepted [bytes].
 _SIZE_MAX = 1 << 26
 
 
 @dataclass(frozen=True)
 class Storing:
-    """The calibration made of the run is about to be stored under `id`, as created at `created_ns`."""
+    """The calibration made from the run is about to be stored under `id`, as created at `created_ns`."""
 
     id: str
     created_ns: int
@@ -36,16 +36,16 @@ class Storing:
 _EVENTS: dict[str, Any] = {
     kind.__name__: kind for kind in (Setup, Segment, MapTaken, Unseen, Dropped, Solved, Doubted, Storing)
 }
-#: What all maps share stands in Setup; the frame of a map keeps the rest.
+#: Fields that all maps share are stored in Setup; the frame of a map holds the others.
 _SHARED = [shared.name for shared in fields(Setup)]
 _RECORD = [own.name for own in fields(Measurement) if own.name not in _SHARED]
 
-#: The seal that the first frame of a run follows.
+#: Seal that precedes the first frame of a run.
 FIRST = b"\0" * _SEAL
 
 
 def encode(event: Event | Storing, before: bytes) -> tuple[bytes, bytes]:
-    """`event` as a frame that follows the seal `before`, and its own seal."""
+    """`event` as a frame that follows the seal `before`, and the seal of this frame."""
     arrays: list[bytes] = []
     head = {"event": type(event).__name__, "fields": _plain(event, arrays)}
     text, payload = json.dumps(head).encode(), b"".join(arrays)
@@ -55,10 +55,10 @@ def encode(event: Event | Storing, before: bytes) -> tuple[bytes, bytes]:
 
 
 def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
-    """The events of whole frames from the beginning on: event, end of its frame, seal. Ends at the first that is not.
+    """Decode frames from the beginning: event, end of its frame, seal. Ends at the first incomplete or damaged frame.
 
     Raises:
-        ValueError: a frame is whole but of another version.
+        ValueError: a frame is intact, but of another version.
     """
     seal, position, setup = FIRST, 0, None
     start = len(_MARK) + _LENGTHS.size
@@ -79,7 +79,7 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
 
 
 def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Event | Storing:
-    """The event in a frame; its map, if it has one, was taken with `setup`."""
+    """The event in a frame; if it contains a map, that was taken with `setup`."""
     try:
         values = _rebuilt(head["fields"], payload)
         if "record" in values:
@@ -95,12 +95,12 @@ def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Ev
 
 
 def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
-    """Fields of a dataclass for JSON; arrays go to `arrays`, their shape and place stay."""
+    """Fields of a dataclass for JSON; arrays are appended to `arrays` and replaced by their shape and position."""
     result: dict[str, Any] = {}
     for name in _RECORD if isinstance(value, Measurement) else [field.name for field in fields(value)]:
         item = getattr(value, name)
         if name == "temperature" and math.isnan(item):
-            continue  # as before it was kept
+            continue  # left out, as in journals older than this field
         if isinstance(item, np.ndarray):
             place = sum(map(len, arrays))
             arrays.append(np.ascontiguousarray(item, dtype="<f8").tobytes())
@@ -111,7 +111,7 @@ def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
 
 
 def _rebuilt(values: dict[str, Any], payload: memoryview) -> dict[str, Any]:
-    """The fields again, dataclasses as dictionaries of theirs."""
+    """The inverse of :func:`_plain`; dataclasses become dictionaries of their fields."""
     made: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, dict) and "shape" in value:

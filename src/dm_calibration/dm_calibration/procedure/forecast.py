@@ -1,4 +1,4 @@
-"""What a hysteresis plan will take and give, before anything moves."""
+"""Duration and accuracy of a hysteresis plan, estimated before anything moves."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,22 +15,22 @@ from dm_common.figures import in_nanometres, rounded, told_from
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 
-#: A run stands still when so many parts together better it by less than this share.
+#: A run no longer improves if this number of parts together lowers the error by less than this share.
 STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
-#: Error of the moves of a mirror never calibrated after a run of one map per actuator, m; it falls with the root of the
+#: Error of moves after a run of one map per actuator, for a mirror never calibrated, m; it falls with the root of the
 #: number of maps. Median of 29 mirrors drawn at random (seeds 7646 to 7675): 1.5 nm after 314 maps. One mirror in ten
-#: reached 3.0 nm only.
+#: only reached 3.0 nm.
 TYPICAL_LAW = 4.5e-9
-#: A run that errs by more than this multiple of what is typical has most likely not found the law yet.
+#: If the error of a run exceeds the typical one by this factor, the law has most likely not been found yet.
 WORST_LAW = 2.2
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Attributes: s; m as `HysteresisFit.held_out_max_zernike`, 0 = not known without an influence function; maps,
-    0 = all of the plan.
+    """What to expect: duration, s; error of moves, m, as `HysteresisFit.held_out_max_zernike`, 0 = not known; number of
+    maps, 0 = all of the plan.
     """
 
     duration: float
@@ -38,10 +38,10 @@ class Forecast:
     maps: int = 0
 
     def accuracy(self, until: float, drawn: bool) -> str:
-        """What moves will be right to where `until` (m) is asked for, 0 = nothing; "" = it is not known.
+        """A phrase on the accuracy to expect, compared with `until` (m; 0 = none asked for); "" = it is not known.
 
         Args:
-            drawn: this mirror was never calibrated: the figure is what mirrors drawn at random reached.
+            drawn: this mirror was never calibrated: the figure is that of mirrors drawn at random.
         """
         if not self.max_zernike > 0.0:
             return ""
@@ -61,14 +61,14 @@ def forecast(
     until: float = 0.0,
     guessed: float = 1.0,
 ) -> Forecast:
-    """Duration and accuracy to expect of `plan`; accuracy only of hysteresis plans.
+    """Expected duration and accuracy of `plan`; accuracy only of hysteresis plans.
 
     Args:
         settle_time: s between command and map.
-        earlier: calibration of the same mirror, which says what its law leaves; None = there is none.
-        map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or `guessed`.
-        until: m at which the run ends, where its plan may.
-        guessed: s that a map is said to take where nothing tells it.
+        earlier: calibration of the same mirror, which gives the error that its law leaves; None = there is none.
+        map_time: s that the last map took; 0 = none was taken: estimated from `earlier`, else `guessed`.
+        until: accuracy at which the run ends, m, if its plan may end early.
+        guessed: s per map if nothing else is known.
     """
     if not map_time:
         map_time = guessed
@@ -79,7 +79,7 @@ def forecast(
     time = np.cumsum(step_times(plan.steps, settle_time, map_time))[measured]
     duration = float(time[-1]) if len(time) else 0.0
     tested = any(step.kind is StepKind.CHECK for step in plan.steps)
-    if not tested or (earlier is None and mirror.actuators < 2):  # what is typical is of many
+    if not tested or (earlier is None and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
         return Forecast(duration, 0.0)
     law = left_of_one_map(earlier, mirror)
     expected = Forecast(duration, 0.0)
@@ -91,7 +91,7 @@ def forecast(
 
 
 def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Floats:
-    """How long each of `steps` takes, s, where a map takes `map_time` (s) beyond the settle time."""
+    """Duration of each of `steps`, s, if a map takes `map_time` (s) beyond the settle time."""
     return np.array(
         [
             map_time + step.settle_share * settle_time + step.dwell if step.takes_map else TYPICAL_DEGAUSS_S
@@ -101,9 +101,9 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
 
 
 def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
-    """What the law of `mirror` leaves of moves after one map, m, by its `earlier` calibration or mirrors like it.
+    """Error of moves that one map would leave, m, from the `earlier` calibration of `mirror` or from mirrors like it.
 
-    It falls as the root of the number of maps.
+    The error is inversely proportional to the root of the number of maps.
     """
     if earlier is not None and earlier.hysteresis is not None:
         return float(earlier.hysteresis.held_out_max_zernike * np.sqrt(earlier.hysteresis.maps))
@@ -111,14 +111,14 @@ def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
 
 
 def expected_end(plan: Plan, done: int, reached: float, until: float, law: float) -> tuple[int, float]:
-    """The number of steps of `plan` after which `until` (m) is expected, or all, and what is expected then, m.
+    """The number of steps of `plan` after which `until` (m) is expected, or all, and the error expected then, m.
 
-    It falls as the root of the number of maps once the law is found, and at once where it is found: before that
-    nothing is expected, 0.
+    Once the law is found, the error is inversely proportional to the root of the number of maps. It falls suddenly when
+    the law is found, at a time that cannot be predicted: before, the expected error is 0 (not known).
 
     Args:
         done: steps so far.
-        reached: m, with these.
+        reached: error with these, m.
         law: m, see `left_of_one_map`.
     """
     if reached > WORST_LAW * law / np.sqrt(done):
@@ -130,15 +130,15 @@ def expected_end(plan: Plan, done: int, reached: float, until: float, law: float
 
 
 class GoodEnough:
-    """Whether a hysteresis run may end: it is accurate enough, or more maps do not help.
+    """Whether a hysteresis run may end: it is accurate enough, or more maps no longer help.
 
     Args:
         until: m, as `HysteresisFit.held_out_max_zernike`.
-        report: called with what each part of the run reached, m.
+        report: called with the error reached after each part of the run, m.
         limits: of the signals, as for :func:`~dm_calibration.hysteresis.hysteresis_fit.fit_hysteresis`.
 
     Attributes:
-        reached: m, after each part.
+        reached: error after each part, m.
     """
 
     def __init__(
@@ -158,12 +158,12 @@ class GoodEnough:
 
     @property
     def _no_longer_better(self) -> bool:
-        """Whether the last parts have bettered the best of those before by too little."""
+        """Whether the last parts improved on the best of the earlier parts by too little."""
         before, last = self.reached[:-STANDSTILL_PARTS], self.reached[-STANDSTILL_PARTS:]
         return bool(before) and min(last) > (1.0 - STANDSTILL) * min(before)
 
     def sentence(self, found: float) -> str:
-        """What a run that ended at `found` (m) has reached of what was asked."""
+        """A sentence that compares what a run reached, which ended at `found` (m), with what was asked for."""
         way = ", ".join(rounded(value * 1e9) for value in self.reached)
         parts = f" (part by part {way} nm)" if way else ""
         if found <= self._until:

@@ -1,4 +1,4 @@
-"""One map of a commanded state: tried again when it fails, compared with the others, checked for a bump."""
+"""One map of a commanded state: retried when it fails, compared with the others, checked for a bump."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -23,12 +23,12 @@ WAVELENGTH_TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class ProcedureOptions:
-    """Tries and checks of the measurements.
+    """Retries and checks of the measurements.
 
     Attributes:
         aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
-        fit: options of the fit that the surfaces with a prescribed shape are solved from.
-        bump: what reference frames may differ by.
+        fit: options of the fit from which surfaces with a prescribed shape are solved.
+        bump: largest differences between reference frames.
     """
 
     measure_retries: int = live_parameter(whole(1, 0, 20), "Further tries after a map that failed.")
@@ -54,7 +54,7 @@ class MapAcquisition:
         checkpoint: Callable[[], None],
         guard: Callable[[], None],
     ) -> None:
-        """`note` takes each event; `checkpoint` is asked before a map, `guard` after it: their errors end the run."""
+        """`note` gets each event; `checkpoint` is called before a map, `guard` after it; their errors end the run."""
         self._bench, self._mirror, self._options = bench, mirror, options
         self.outcome = outcome
         self._note, self._checkpoint, self._guard = note, checkpoint, guard
@@ -64,7 +64,7 @@ class MapAcquisition:
             self._bump.take(MapTaken(record, centre=centre))
 
     def swung(self) -> None:
-        """The actuators went through their whole range since the last map, nobody knows where the mirror went."""
+        """Note that since the last map the actuators were degaussed and the mirror may have been moved or realigned."""
         self._bump.degaussed()
         self._swung = True
 
@@ -76,8 +76,8 @@ class MapAcquisition:
             applied: (N,) as written.
 
         Raises:
-            MeasurementError: no try gave one.
-            Refusal: a reference frame shows that the mirror was bumped, and another map of it does too.
+            MeasurementError: every try failed.
+            Refusal: a reference frame shows that the mirror was bumped, and so does a second one.
         """
         for attempt in range(self._options.measure_retries + 1):
             self._checkpoint()
@@ -89,7 +89,7 @@ class MapAcquisition:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
         if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._swung):
-            taken = self._map(label, step, number, applied)  # bad, or the mirror stands otherwise: this one tells
+            taken = self._map(label, step, number, applied)  # bad map, or moved mirror: a second map decides
             if suspicion := self._bump.change(taken, self._swung):
                 self._stop_bumped(label, suspicion)
         self._note(taken)
@@ -97,7 +97,7 @@ class MapAcquisition:
         self._swung = False
 
     def _stop_bumped(self, label: str, suspicion: str) -> None:
-        """End the run; what was measured since the last good reference frame is in doubt."""
+        """End the run; the maps since the last good reference frame are in doubt."""
         if self._swung:
             raise Refusal(
                 ErrorCode.MAP_REJECTED,
@@ -114,7 +114,7 @@ class MapAcquisition:
         )
 
     def _map(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
-        """A map that can be compared with the others."""
+        """Take a map that is comparable with the others."""
         measured = self._bench.measure(label)
         self._guard()
         check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
@@ -148,7 +148,7 @@ def check_comparable(
         aperture_tolerance: relative.
 
     Raises:
-        MeasurementError: naming what differs, its value, and what the others have.
+        MeasurementError: the message names what differs, its value, and that of the others.
     """
     if measured.radius > 0.0 and abs(measured.radius - working_radius) > aperture_tolerance * working_radius:
         different = (
@@ -171,7 +171,7 @@ def check_comparable(
 
 
 def _other_setup(measured: Measurement, setup: Setup) -> str:
-    """What a map does not share with those before; "" = nothing."""
+    """How a map differs in setup from those before; "" = not at all."""
     if not same_points(measured.points, setup.points):
         return "sampled at other points than the maps before: measure the whole run with one interferometer node"
     if abs(measured.wavelength - setup.wavelength) > WAVELENGTH_TOLERANCE * setup.wavelength:

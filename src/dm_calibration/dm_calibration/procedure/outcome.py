@@ -1,7 +1,7 @@
-"""What a run has measured so far, as the sum of what happened to it.
+"""The results of a run so far, as the sum of its events.
 
-Each thing that happens is an event. A live run takes its events one by one and keeps each on disk
-(:mod:`dm_calibration.procedure.run_journal`); a run that was cut off is what its kept events add up to. Both go through
+Whatever happens in a run is an event. A live run takes its events one by one and keeps each on disk
+(:mod:`dm_calibration.procedure.run_journal`); an interrupted run is restored from the events kept. Both go through
 :meth:`Outcome.take`, so they cannot differ.
 """
 
@@ -17,7 +17,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 
-#: A place that is not known.
+#: A position that is not known.
 NOWHERE = (float("nan"), float("nan"))
 
 
@@ -44,7 +44,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Segment:
-    """The history of the actuators begins: after the degauss that a run begins with, or goes on with.
+    """A known history of the actuators begins: with the degauss at the start, or at the resumption, of a run.
 
     Attributes:
         number: 0 for the first.
@@ -60,7 +60,7 @@ class MapTaken:
     """A map was measured.
 
     Attributes:
-        radius_known: whether it tells its aperture radius.
+        radius_known: whether the map contains its aperture radius.
         centre: of the aperture on the map, m; NaN = not known.
     """
 
@@ -77,7 +77,7 @@ class Unseen:
 
 
 def without_map(record: Measurement, **changes: Any) -> Unseen:
-    """A command without a map: `record` less all that its map tells, and with `changes`."""
+    """A command without a map: `record` without the results of its map, and with `changes`."""
     nothing = np.full_like(record.coefficients, np.nan)
     unseen = replace(record, coefficients=nothing, sigma=nothing, sag=np.full_like(record.sag, np.nan), nominal=None)
     unseen = replace(unseen, residual_rms=np.nan, valid_fraction=0.0, file="", sha256="", moved_ns=0)
@@ -86,7 +86,7 @@ def without_map(record: Measurement, **changes: Any) -> Unseen:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A map of `step` could not be had; `whole`: the step is given up."""
+    """No map of `step` could be taken in one try; `whole`: the step is given up."""
 
     step: int
     reason: str
@@ -95,7 +95,7 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Solved:
-    """The signals of a shape were solved from an influence function: the shape and what was reduced."""
+    """The signals of a shape were solved with an influence function: the shape, and a remark if it was reduced."""
 
     target: str
     remark: str = ""
@@ -103,7 +103,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class Doubted:
-    """All but the first `kept` maps are in doubt, for `reason`; their steps are open again."""
+    """All but the first `kept` maps are in doubt, for `reason`; their steps are to be measured again."""
 
     kept: int
     reason: str
@@ -114,12 +114,12 @@ Event = Setup | Segment | MapTaken | Unseen | Dropped | Solved | Doubted
 
 @dataclass
 class Outcome:
-    """What a run has measured so far.
+    """The results of a run so far.
 
     Attributes:
-        setup: what all of them share; None before the first.
-        dropped: "label: reason" of each map or state that gave none.
-        remarks: what was measured differently than asked.
+        setup: properties that all maps share; None before the first map.
+        dropped: "label: reason" of each map or state that could not be measured.
+        remarks: what was measured differently than requested.
         centres: of the aperture on each map of `records`, m; NaN = not known.
     """
 
@@ -132,7 +132,7 @@ class Outcome:
     segment: int = 0
     centres: list[tuple[float, float]] = field(default_factory=list)
     _given_up: dict[int, int] = field(default_factory=dict)
-    # Of what came after the last map: drops, and commands without a map.
+    # Events since the last map: drops, and commands without a map.
     _failing: list[Dropped] = field(default_factory=list)
     _unseen: int = 0
 
@@ -162,7 +162,7 @@ class Outcome:
                 self._doubt(event)
 
     def tried(self, step: int) -> int:
-        """Maps of the state `step` that were taken or given up."""
+        """Number of maps of the state `step` that were taken or given up."""
         return sum(record.step == step for record in self.records) + self._given_up.get(step, 0)
 
     def maps(self) -> MapSet:
@@ -180,7 +180,7 @@ class Outcome:
         self.centres.append(centre)
 
     def _begin(self, number: int) -> None:
-        """A new segment. What failed last is tried again: that may be why the run ended."""
+        """Begin a segment. The last failures are forgotten and tried again: they may be why the run ended."""
         if number and self._failing:
             del self.dropped[-len(self._failing) :]
             for drop in self._failing:

@@ -14,16 +14,16 @@ from dm_common import Floats
 from dm_common.mirror import Mirror
 from dm_common.values import live_parameter, real, whole
 
-#: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
+#: Commands between two reference frames of a hysteresis plan; few suffice, as most of the drift is modelled as creep.
 HYSTERESIS_REFERENCE_EVERY = 100
-#: A run may end when it is accurate enough as soon as a law can be found, and again whenever there are so many commands
-#: more, as a share of those before; counted in steps. Each part has its checks.
+#: A run with `until` may first end when there are enough commands to find a law, and then each time that their number
+#: has grown by this share, in multiples of the second number. Each part has its own check moves.
 NEXT_PART, PART_STEP = 0.25, 20
-#: Commands after which it ends in any case, where the goal gives no other number.
+#: Commands after which such a run ends in any case, unless the goal gives another number.
 LAST_PART_ENDS = 420
-#: Share of the neighbour limit that shapes as in use may take up: rounding must not break it.
+#: Share of the neighbour limit that shapes as in use may take up, below 1 to leave room for rounding.
 IN_USE_ROOM = 0.999
-#: Share of the range from mid range to an end from which on a mirror that is flat there is one-sided.
+#: A mirror counts as one-sided if it is flat further from mid range than this share of the half range.
 ONE_SIDED = 0.5
 
 
@@ -43,10 +43,10 @@ class Step:
 
     Attributes:
         label: unique in the plan.
-        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. Of one as
-            in use, what it bends the mirror by when the figure is flat: see :func:`shape_in_use`.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. For a shape
+            as in use: signals that would make it if the figure were flat, see :func:`shape_in_use`.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
-        dwell: to hold the shape beyond the settle time, s.
+        dwell: time to hold the shape beyond the settle time, s.
     """
 
     label: str
@@ -58,17 +58,17 @@ class Step:
 
     @property
     def takes_map(self) -> bool:
-        """Whether it ends with a map: all but a degauss do."""
+        """Whether the step ends with a map: all but a degauss do."""
         return self.kind is not StepKind.DEGAUSS
 
     @property
     def needs_model(self) -> bool:
-        """Whether the signals must be solved from an influence function first."""
+        """Whether the signals must first be solved with an influence function."""
         return self.in_use or (self.kind is StepKind.SURFACE and self.signals is None)
 
     @property
     def in_use(self) -> bool:
-        """Whether it makes a shape as in use, about the flat mirror."""
+        """Whether the step makes a shape as in use, about the flat mirror."""
         return self.kind in (StepKind.IN_USE, StepKind.CHECK)
 
 
@@ -97,7 +97,7 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps in order, what differs from what was asked, and the steps before which the run may end."""
+    """The steps in order, deviations from what was asked for, and the steps before which the run may end."""
 
     kind: PlanKind
     steps: tuple[Step, ...]
@@ -109,10 +109,10 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
     """The plan of one calibration run.
 
     Raises:
-        UnknownNameError: a surface that Table 1 does not have, naming the near ones.
-        ValueError: a surface asked for by name that this mirror cannot have, or the plan does not measure, or an option
-            out of its range.
-        TooFewMapsError: too few maps to find the hysteresis of so many actuators.
+        UnknownNameError: a surface that is not in Table 1; the message names similar ones.
+        ValueError: a surface was requested that this mirror cannot make or the plan does not measure, or an option is
+            out of range.
+        TooFewMapsError: too few maps to identify the hysteresis of all actuators.
     """
     options = options or PlanOptions()
     names = surfaces.check_names(options.surfaces)
@@ -135,10 +135,10 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
 
 
 def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
-    """A degauss, repeated maps at rest, and the excitation with its degausses, a map at rest after each.
+    """A degauss, repeated maps at rest, and the excitation with its degausses, each followed by a map at rest.
 
     Raises:
-        TooFewMapsError, ValueError: as `excitation`; ValueError, a run that would not begin with a degauss.
+        TooFewMapsError, ValueError: as `excitation`; ValueError also if the run would not begin with a degauss.
     """
     if not options.degauss:
         raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
@@ -166,14 +166,14 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
 
 
 def _parts(options: PlanOptions, actuators: int) -> list[int]:
-    """Commands of each part of a hysteresis plan: one, or where it may end early some."""
+    """Number of commands in each part of a hysteresis plan: one part, or several if the run may end early."""
     most = options.hysteresis_maps
     if not options.until:
         return [most]
     ends = [PART_STEP * math.ceil(fewest_maps(actuators) / PART_STEP)]
     while ends[-1] < most:
         ends.append(ends[-1] + PART_STEP * max(1, round(NEXT_PART * ends[-1] / PART_STEP)))
-    # A rest that is too short to be a part of its own joins the last.
+    # A remainder that is too short for a part of its own is added to the last part.
     ends = [end for end in ends if end <= most - PART_STEP]
     return np.diff([0, *ends, most]).tolist()
 
@@ -181,8 +181,8 @@ def _parts(options: PlanOptions, actuators: int) -> list[int]:
 def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
     """`step` with the signals that make its shape on a flat surface, as every request in use does.
 
-    The law is fitted, and tested, where it will be used: about the signals that flatten the mirror. Where that is an
-    end of its range, as of a membrane that is only pulled, at levels all over the range.
+    The law is fitted and tested where it will be used: about the signals that flatten the mirror. If these are at an
+    end of the range, as for a membrane that can only be pulled, the levels are spread over the whole range instead.
     """
     assert step.signals is not None
     limits = mirror.limits
@@ -193,8 +193,8 @@ def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Ste
         away = step.signals - mirror.rest
         pattern = away - away.mean()
         size = max(float(np.abs(pattern).max()), 1e-12)
-        # The step's level is some share of the room beside its pattern: here it is that share of the whole range, and
-        # the pattern takes what is left.
+        # The level of the step is a share of the room beside its pattern. Here it becomes the same share of the whole
+        # range, and the pattern is limited to the room that is left.
         level = IN_USE_ROOM * room * float(np.clip(away.mean() / max(room - size, 1e-12), -1.0, 1.0))
         share = (IN_USE_ROOM * room - abs(level)) / size
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)
@@ -203,7 +203,7 @@ def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Ste
 
 
 def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
-    """Push and pull of each actuator about mid range, pushed first; the two directions follow each other at once."""
+    """Push, then pull, of each actuator about mid range, one directly after the other."""
     half_range = mirror.limits.half_range
     steps = []
     smallest = 1.0
@@ -211,9 +211,9 @@ def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
         for sign, mark in ((1.0, "+"), (-1.0, "-")):
             signals = mirror.rest
             signals[k] += sign * amplitude * half_range
-            # A poke scaled about the mean would move every actuator; shrinking the poke keeps the others at rest.
+            # Scaling about the mean would move every actuator; a smaller poke keeps the others at rest.
             _, factor = mirror.limits.scaled(signals)
-            if factor < 1.0:  # and a hair less: the driver checks the limit exactly
+            if factor < 1.0:  # and slightly less, since the driver checks the limit exactly
                 signals[k] = mirror.rest[k] + factor * (1.0 - 1e-12) * (signals[k] - mirror.rest[k])
             smallest = min(smallest, factor)
             steps.append(Step(f"poke{mark}{k + 1:02d}", StepKind.POKE, signals))

@@ -1,7 +1,7 @@
-"""The calibration procedure: go through a plan, command, settle, measure, and lose no good map to a bad one.
+"""The calibration procedure: follow a plan, command, settle, measure, and lose no good map because of a bad one.
 
-It knows no ROS: what moves the mirror and what measures it are callables. A run that was cut off goes on from what it
-had measured: with a degauss, since nobody knows what the actuators went through meanwhile, and a reference frame.
+It is independent of ROS: the mirror and the instrument are reached through callables. An interrupted run continues from
+its maps with a degauss, since the history of the actuators is not known meanwhile, and a reference frame.
 """
 
 import time
@@ -24,13 +24,13 @@ from dm_common.mirror import Mirror
 
 __all__ = ["Outcome", "Procedure", "ProcedureOptions", "Progress"]
 
-#: Maps of the mirror at rest with which a hysteresis run goes on: they show where the figure stands now.
+#: Maps of the mirror at rest when a hysteresis run is resumed: they show the present figure.
 RESUME_MAPS = 3
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the procedure stands: step `done` of `steps`."""
+    """Progress of the procedure: step `done` of `steps`."""
 
     label: str
     kind: StepKind
@@ -41,7 +41,7 @@ class Progress:
 
 
 class Procedure:
-    """One run of a plan on a bench. `outcome` can be read at any time, also after a failure."""
+    """One run of a plan on a bench. `outcome` can be read at any time, even after a failure."""
 
     def __init__(
         self,
@@ -61,12 +61,12 @@ class Procedure:
         """Prepare a run.
 
         Args:
-            model: solves the surfaces with a prescribed shape; None = one fitted to the maps of this run before the
-                first of their kind.
-            outcome: of a run of the same plan that was cut off; None = begin.
-            keep: called with each event before it counts; what it raises ends the run.
-            guard: asked before each step; what it raises ends the run.
-            enough: asked where the plan may end, whether it does.
+            model: solves the surfaces with a prescribed shape; None = fit one to the maps of this run before the first
+                such surface.
+            outcome: of an interrupted run of the same plan; None = begin.
+            keep: called with each event before it takes effect; an exception ends the run.
+            guard: called before each step; an exception ends the run.
+            enough: called at the steps where the plan may end; True ends the run.
         """
         self.outcome = outcome or Outcome(remarks=list(plan.remarks))
         self._plan, self._mirror, self._bench = plan, mirror, bench
@@ -80,9 +80,9 @@ class Procedure:
         self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)
 
     def run(self) -> Outcome:
-        """Go through all steps that are still to be done.
+        """Go through all steps that are not done yet.
 
-        The caller brings the mirror back to rest afterwards, however this ends.
+        The caller returns the mirror to rest afterwards, however this ends.
 
         Raises:
             Cancelled: `cancelled()` became true; noticed within one step.
@@ -118,7 +118,7 @@ class Procedure:
             self._measure_state(step, number, self._options.maps_per_state)
 
     def _go_on(self, done: int) -> None:
-        """Begin a new segment after an interruption: degauss, and a map of the mirror at rest."""
+        """Begin a new segment after an interruption: degauss, then a map of the mirror at rest."""
         last = self.outcome.records[-1].label
         self._checkpoint()
         if self._plan.steps[0].kind is StepKind.DEGAUSS:
@@ -144,12 +144,12 @@ class Procedure:
         self._guard()
 
     def _note(self, event: Event) -> None:
-        """On disk first, so that nothing counts that could get lost."""
+        """Write the event to disk before it takes effect, so that nothing counts that could get lost."""
         self._keep(event)
         self.outcome.take(event)
 
     def _solved(self, step: Step, number: int) -> Step | None:
-        """`step` with its signals; None, with the reason in `dropped`, when no model can be had."""
+        """`step` with its signals; None, with the reason in `dropped`, if there is no model to solve them with."""
         if not step.needs_model:
             return step
         try:
@@ -170,7 +170,7 @@ class Procedure:
         return replace(step, signals=surface.signals, nominal=surface.nominal)
 
     def _maps_before_solving(self, kind: StepKind) -> MapSet:
-        """The maps before the first solved shape of a kind, the same whether the run was interrupted or not."""
+        """The maps before the first solved shape of a kind, so that an interruption does not change the model."""
         maps = self.outcome.maps()
         solved = np.array([one == kind.value for one in maps.kind])
         if kind is StepKind.SURFACE:
@@ -199,14 +199,14 @@ class Procedure:
             raise Refusal(failure.error_code, f"{self._failures} states in a row gave no map; the last: {failure}")
 
     def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
-        """Keep a command without a map where hysteresis is to be identified: the actuators had it all the same.
+        """If hysteresis is to be identified, keep a command without a map: it is part of the actuators' history.
 
-        Its time is not known; it counts as right after the map before.
+        Its time is not known; it is set to that of the map before.
         """
         records = self.outcome.records
         if self._plan.kind is not PlanKind.HYSTERESIS or not records:
             return
-        # A reference frame without a map is a command like others: no figure is followed from it, no bump judged by it.
+        # A reference frame without a map becomes an ordinary command: it serves neither the figure nor the bump check.
         kind = StepKind.EXCITATION if step.kind is StepKind.REFERENCE else step.kind
         told = {"label": step.label, "kind": kind.value, "step": number, "signals": step.signals, "applied": applied}
         self._note(without_map(records[-1], **told))

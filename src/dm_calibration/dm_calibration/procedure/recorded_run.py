@@ -1,7 +1,7 @@
-"""A calibration made again from a recording: the same procedure on a bench that answers from what was recorded.
+"""A calibration repeated from a recording: the same procedure on a bench that replays what was recorded.
 
-A recording holds what the driver reported, what the interferometer published, and the plan, which feedback tells.
-Knows no ROS.
+A recording holds the reports of the driver, the maps of the interferometer, and the plan, which is part of the
+feedback. Independent of ROS.
 """
 
 import json
@@ -20,7 +20,7 @@ from dm_common.mirror import Mirror
 
 
 class RecordingError(ValueError):
-    """The recording does not hold a run, or not the whole of it; the message says what is missing."""
+    """The recording holds no run, or only a part of one; the message names what is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Move:
     """One move that the driver completed.
 
     Attributes:
-        stamp_ns: when its end was written to the electronics.
+        stamp_ns: time at which its end was written to the electronics.
         requested, applied: (N,) as the driver reported.
     """
 
@@ -44,8 +44,8 @@ class RecordedRun:
 
     Attributes:
         maps: in the order of their stamps.
-        plan: see :func:`plan_text`.
-        model: of the calibration in use when it began; None = none.
+        plan: as made by :func:`plan_text`.
+        model: of the calibration in use when the run began; None = none.
     """
 
     mirror: Mirror
@@ -56,7 +56,7 @@ class RecordedRun:
 
 
 class RecordedBench:
-    """Answers as the bench did; implements :class:`dm_common.measurement.Bench`."""
+    """Replays a recorded bench; implements :class:`dm_common.measurement.Bench`."""
 
     def __init__(self, run: RecordedRun) -> None:
         self._moves, self._maps = run.moves, run.maps
@@ -65,7 +65,7 @@ class RecordedBench:
         self._taken = 0
 
     def degauss(self) -> None:
-        """Pass the next degauss.
+        """Skip to the next degauss.
 
         Raises:
             RecordingError: there is none.
@@ -77,10 +77,10 @@ class RecordedBench:
         raise RecordingError("the recording ends before a degauss of the run")
 
     def apply(self, signals: Floats) -> Floats:
-        """What was written when `signals` were commanded.
+        """The signals that were written when `signals` were commanded.
 
         Raises:
-            RecordingError: they were not.
+            RecordingError: `signals` were not commanded.
         """
         for index in range(self._next_move, len(self._moves)):
             move = self._moves[index]
@@ -96,14 +96,14 @@ class RecordedBench:
         )
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
-        """Nothing to wait for."""
+        """Return at once: there is nothing to wait for."""
         return True
 
     def measure(self, label: str) -> Measurement:
-        """The next map between this move and the next.
+        """The next map that was taken between this move and the next one.
 
         Raises:
-            MeasurementError: there is none, as when it was dropped live.
+            MeasurementError: there is none, for example because it was dropped in the live run.
         """
         begin, end = self._window
         found = [measured for measured in self._maps if begin <= measured.stamp_ns < end]
@@ -114,15 +114,15 @@ class RecordedBench:
 
 
 def plan_text(plan: PlanKind, options: PlanOptions, maps_per_state: int) -> str:
-    """What feedback tells of a run, for a recording of it."""
+    """The plan as text in the feedback of a run, from which a recording can be repeated."""
     return json.dumps({"plan": plan, "maps_per_state": maps_per_state, **asdict(options)})
 
 
 def planned(text: str, mirror: Mirror) -> tuple[Plan, int]:
-    """The plan of a run and its maps in a state, from what feedback told.
+    """The plan of a run and its number of maps per state, from the text in its feedback.
 
     Raises:
-        RecordingError: it is of another version.
+        RecordingError: the text is of another version.
     """
     try:
         values = json.loads(text)
@@ -135,7 +135,7 @@ def planned(text: str, mirror: Mirror) -> tuple[Plan, int]:
 
 
 def _difference(plan: Plan, moves: Sequence[Move]) -> str:
-    """Where `moves` are not those of `plan`; "" = nowhere. Solved steps agree with any move."""
+    """Where `moves` differ from those of `plan`; "" = nowhere. Solved steps match any move."""
     end = _end(plan, moves)
     for step, move in zip(plan.steps[:end], moves, strict=False):
         if step.kind is StepKind.DEGAUSS:
@@ -147,7 +147,7 @@ def _difference(plan: Plan, moves: Sequence[Move]) -> str:
 
 
 def _end(plan: Plan, moves: Sequence[Move]) -> int:
-    """The step before which the run ended: one that was accurate enough there went back to rest and no further."""
+    """The step before which the run ended: a run that was accurate enough there ended with a move back to rest."""
     last = len(moves) - 1
     rest = next((step.signals for step in plan.steps if step.kind is StepKind.REFERENCE), None)
     ended = last in plan.ends and rest is not None and np.array_equal(moves[last].requested, rest)
@@ -155,16 +155,16 @@ def _end(plan: Plan, moves: Sequence[Move]) -> int:
 
 
 def repeat_run(run: RecordedRun, options: ProcedureOptions | None = None) -> tuple[Plan, Outcome]:
-    """The run made again from its recording: its plan and everything measured.
+    """Repeat the run from its recording; returns its plan and everything measured.
 
     Raises:
-        RecordingError: the recording does not hold the whole run.
-        Refusal: as live, when several states in a row gave no map.
+        RecordingError: the recording does not hold the complete run.
+        Refusal: as in the live run, if several states in a row gave no map.
     """
     plan, count = planned(run.plan, run.mirror)
     if reason := _difference(plan, run.moves):
         raise RecordingError(reason)
-    # As live: a full plan solves its shapes on its own pokes.
+    # As in the live run, a full plan solves its shapes with its own pokes.
     model = run.model if plan.kind is PlanKind.SURFACES else None
     end = _end(plan, run.moves)
 

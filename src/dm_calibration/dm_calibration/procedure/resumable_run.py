@@ -1,4 +1,4 @@
-"""Which run a `Calibrate` goal goes on with, and what makes two runs the same. Knows no ROS."""
+"""Which run a `Calibrate` goal resumes, and when two runs are the same. Independent of ROS."""
 
 import hashlib
 import json
@@ -18,7 +18,7 @@ from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.atomic_write import StoreError
 from dm_common.mirror import Mirror
 
-#: Room that must be there for each map, in the journal and then in the calibration [bytes].
+#: Free space required for each map, in the journal and then in the calibration [bytes].
 ROOM_PER_MAP = 20_000
 
 
@@ -27,9 +27,9 @@ class OpenRun:
     """A run with its journal.
 
     Attributes:
-        storing: the calibration it may have been stored as already; None = it had not come so far.
-        resumed: what it goes on from; "" = it begins.
-        notes: what became of other unfinished runs.
+        storing: the calibration as which it may already have been stored; None = it had not come that far.
+        resumed: a sentence if an earlier run is resumed; "" = a new run begins.
+        notes: what was done with other unfinished runs.
     """
 
     journal: RunJournal
@@ -40,7 +40,7 @@ class OpenRun:
 
 
 def mirror_facts(mirror: Mirror) -> dict[str, Any]:
-    """What tells one mirror from another, and one configuration of it, for JSON."""
+    """Facts, for JSON, by which mirrors and their configurations are distinguished."""
     return {
         "name": mirror.name,
         "serial": mirror.serial,
@@ -55,25 +55,25 @@ def mirror_facts(mirror: Mirror) -> dict[str, Any]:
 def identity_of(
     plan: Plan, options: PlanOptions, mirror: Mirror, settings: Mapping[str, Any], driver: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a goal must share with an unfinished run to go on with it.
+    """Facts in which a goal must agree with an unfinished run to resume it.
 
     Args:
-        settings: of the goal beside the plan's options.
-        driver: what the driver tells of its wiring and limits.
+        settings: of the goal, besides the plan's options.
+        driver: the driver's facts on wiring and limits.
     """
     described = [(step.label, step.kind.value, step.dwell) for step in plan.steps]
     signals = [step.signals for step in plan.steps if step.signals is not None]
     steps = hashlib.sha256(json.dumps(described).encode()).hexdigest()
     facts = {
         "plan": plan.kind.name,
-        # Whatever else of the options the plan uses shows in its steps.
+        # All other options that the plan uses show in its steps.
         "until": options.until,
         "plan_sha256": _hash(*signals) + steps,
         "mirror": mirror_facts(mirror),
         "settings": dict(settings),
         "driver": dict(driver),
     }
-    # As it comes back from a file: tuples become lists.
+    # Through JSON, as when read from a file: tuples become lists.
     result: dict[str, Any] = json.loads(json.dumps(facts))
     return result
 
@@ -88,15 +88,15 @@ def open_run(
     maps_per_state: int = 1,
     note: str = "",
 ) -> OpenRun:
-    """Go on with the newest unfinished run of the same identity, or begin one.
+    """Resume the newest unfinished run of the same identity, or begin a new one.
 
     Args:
-        age_max: s since the last event of one to go on with; 0 = never.
-        fresh: do not go on with any, this time.
-        now_ns: time of the clock that maps are stamped with, ns; 0 = not known.
+        age_max: longest time since the last event of a run that is resumed, s; 0 = resume none.
+        fresh: resume none this time.
+        now_ns: time of the clock that stamps the maps, ns; 0 = not known.
 
     Raises:
-        StoreError: the journal cannot be written, or there is no room for all maps.
+        StoreError: the journal cannot be written, or there is not enough space for all maps.
     """
     notes = [f"unfinished run {text}" for text in runs.others(identity)]
     chosen: Kept | None = None
@@ -126,7 +126,7 @@ def open_run(
 
 
 def _reason_against(found: Kept, plan: Plan, age_max: float, fresh: bool, now_ns: int) -> str:
-    """Why an unfinished run is not to go on; "" = it is."""
+    """Why an unfinished run is not to be resumed; "" = it is."""
     age = 1e-9 * (time.time_ns() - found.last_ns)
     if fresh:
         return "a fresh run was asked for"

@@ -1,9 +1,9 @@
-"""The journal of one run: each event is on the disk before it counts, so that a power cut loses nothing.
+"""The journal of one run: each event is on disk before it takes effect, so that a power cut loses nothing.
 
-A folder ``<id>/`` holds ``manifest.json`` (plan, settings, mirror, software; written once, whole or not at all) and
-``events`` (appended and synced frame by frame). A frame that a power cut tore is cut off when the run goes on. Only
+A folder ``<id>/`` holds ``manifest.json`` (plan, settings, mirror, software; written once and atomically) and
+``events`` (appended and synced frame by frame). A frame torn by a power cut is cut off when the run is resumed. Only
 coefficients and samples are kept, some kilobytes a map; the full maps stay in the interferometer's folder, and the
-journal has their names and hashes.
+journal holds their names and hashes.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ MANIFEST, EVENTS = "manifest.json", "events"
 
 
 class JournalError(ValueError):
-    """A journal cannot be read; the message says which and why."""
+    """A journal cannot be read; the message names it and the reason."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What a journal holds: a run to go on with.
+    """Content of a journal: a run that can be resumed.
 
     Attributes:
-        folder: of the journal; its name is the run's.
-        maps: measured, those in doubt included.
+        folder: of the journal; its name is that of the run.
+        maps: number of maps measured, including those in doubt.
         last_ns: wall time of the last write, ns since the epoch.
-        storing: the calibration that was about to be stored; None = the run had not come so far.
-        torn: bytes after the last whole frame.
+        storing: the calibration that was about to be stored; None = the run had not come that far.
+        torn: number of bytes after the last whole frame.
     """
 
     folder: Path
@@ -51,7 +51,7 @@ class Kept:
 
 
 class RunJournal:
-    """The journal of a run that is going on. Use :meth:`create` or :meth:`reopen`."""
+    """The journal of a run in progress. Use :meth:`create` or :meth:`reopen`."""
 
     def __init__(self, folder: Path, handle: int, end: int, seal: bytes) -> None:
         self.folder = folder
@@ -76,7 +76,7 @@ class RunJournal:
 
     @classmethod
     def reopen(cls, folder: Path) -> RunJournal:
-        """The journal in `folder`, to go on after its last whole frame.
+        """The journal in `folder`, to be continued after its last whole frame.
 
         Raises:
             StoreError: it cannot be opened or written.
@@ -90,7 +90,7 @@ class RunJournal:
         return cls(folder, handle, end, seal)
 
     def check_room(self, size: int) -> None:
-        """Try to write `size` bytes, before anything moves; the journal stays as it is.
+        """Check, before anything moves, that `size` more bytes can be written; the journal is unchanged.
 
         Raises:
             StoreError: disk full, read-only, ...
@@ -105,10 +105,10 @@ class RunJournal:
                 os.ftruncate(self._handle, self._end)
 
     def keep(self, event: Event | Storing) -> None:
-        """Append `event`; it is on the disk when this returns.
+        """Append `event`; it is on disk when this returns.
 
         Raises:
-            StoreError: disk full, read-only, ...; the journal is as it was.
+            StoreError: disk full, read-only, ...; the journal is unchanged.
         """
         frame, seal = encode(event, self._seal)
         what = f"map {event.record.label}" if isinstance(event, MapTaken) else type(event).__name__.lower()
@@ -126,15 +126,15 @@ class RunJournal:
         self._end, self._seal = self._end + len(frame), seal
 
     def close(self) -> None:
-        """Let go of the file; the run stays unfinished."""
+        """Close the file; the run stays unfinished."""
         handle, self._handle = self._handle, -1
         if handle >= 0:
             os.close(handle)
 
     def remove(self) -> None:
-        """The run is finished: close and delete its journal. What cannot be deleted stays."""
+        """Close and delete the journal of a finished run. Files that cannot be deleted stay."""
         self.close()
-        # The manifest goes first: without it the rest is no run any more.
+        # The manifest first: without it the folder no longer counts as a run.
         with suppress(OSError):
             (self.folder / MANIFEST).unlink()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -157,7 +157,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder.name}: schema version {content.get('schema_version')}: this software reads {SCHEMA_VERSION}"
         )
     identity = content.get("identity")
-    if isinstance(identity, dict) and "plan_options" in identity:  # of before 0.2: all options, used by the plan or not
+    if isinstance(identity, dict) and "plan_options" in identity:  # before 0.2: all options, even those not used
         identity["until"] = identity.pop("plan_options").get("until", 0.0)
         if identity.get("plan") == "MEMORY":
             identity["plan"] = "HYSTERESIS"
@@ -165,7 +165,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path, remarks: tuple[str, ...] = ()) -> Kept:
-    """What the journal in `folder` holds.
+    """Read the journal in `folder`.
 
     Args:
         remarks: of the plan; the outcome begins with them.

@@ -1,7 +1,7 @@
-"""The folder of runs that were cut off: which of them a new goal goes on with, and what becomes of the others.
+"""The folder of interrupted runs: which of them a new goal resumes, and what is done with the others.
 
-A run goes on when plan, settings and mirror are the same and it is not too old. A run that is not to go on is set
-aside, never deleted at once: its maps may still be wanted. One node at a time works in the folder.
+A run is resumed if plan, settings and mirror are the same and it is not too old. A run that is not to be resumed is set
+aside, never deleted at once: its maps may still be wanted. Only one node at a time works in the folder.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal,
 from dm_common.atomic_write import storing
 from dm_common.errors import ErrorCode, Refusal
 
-#: Name of the folder among the calibrations.
+#: Name of the folder inside the folder of calibrations.
 FOLDER = "unfinished"
-#: Ending of runs that were set aside.
+#: Suffix of runs that were set aside.
 ASIDE = ".set-aside"
-#: So many of those are kept, the newest.
+#: Number of runs set aside that are kept, the newest.
 ASIDE_MAX = 5
-#: Runs with other settings that wait for their goal are kept up to this number, the newest.
+#: Number of runs with other settings that are kept for their own goals, the newest.
 WAITING_MAX = 20
 
 _LOCK = ".lock"
 
 
 class UnfinishedRuns:
-    """Runs in ``<calibrations>/unfinished``. Use as a context manager while a run goes on: only one may."""
+    """Runs in ``<calibrations>/unfinished``. Use as a context manager during a run: only one may be in progress."""
 
     def __init__(self, calibrations: Path) -> None:
         self.folder = calibrations / FOLDER
         self._lock = -1
 
     def __enter__(self) -> UnfinishedRuns:
-        """Take the folder.
+        """Lock the folder.
 
         Raises:
-            Refusal: another node calibrates into it.
-            StoreError: it cannot be made.
+            Refusal: another node is calibrating into it.
+            StoreError: it cannot be created.
         """
         with storing(f"no run can be kept in {self.folder}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
         try:
-            # Ends with the process, also with kill -9.
+            # The lock ends with the process, even with kill -9.
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
@@ -64,20 +64,20 @@ class UnfinishedRuns:
         """The journal of a new run.
 
         Args:
-            about: what is kept for people.
+            about: further facts, for the reader of the manifest only.
 
         Raises:
             StoreError: disk full, read-only, ...
         """
         stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         names = (f"{stem}-{number}" if number else stem for number in range(10_000))
-        # Neither may there be one set aside under the name: this run may have to be set aside too.
+        # Avoid the names of runs set aside as well: this run may have to be set aside too.
         taken = {path.name.removesuffix(ASIDE) for path in self.folder.iterdir()}
         name = next(name for name in names if name not in taken)
         return RunJournal.create(self.folder / name, {"identity": identity, **about})
 
     def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> list[Kept]:
-        """Runs of the same plan, settings and mirror that hold at least a map, the newest first."""
+        """Runs of the same plan, settings and mirror with at least one map, the newest first."""
         found = []
         for folder in self._runs():
             try:
@@ -93,7 +93,7 @@ class UnfinishedRuns:
         return sorted(found, key=lambda run: (run.last_ns, run.folder.name), reverse=True)
 
     def others(self, identity: Mapping[str, Any]) -> list[str]:
-        """Each unfinished run that a goal with `identity` cannot go on with, and why."""
+        """A sentence for each unfinished run that a goal with `identity` cannot resume, with the reason."""
         sentences = []
         for folder in self._runs():
             try:
@@ -109,7 +109,7 @@ class UnfinishedRuns:
         return sentences
 
     def set_aside(self, folder: Path) -> Path:
-        """Keep the run in `folder`, but do not go on with it.
+        """Keep the run in `folder`, but never resume it.
 
         Raises:
             StoreError: read-only, ...
@@ -119,7 +119,7 @@ class UnfinishedRuns:
             return folder.rename(target)
 
     def prune(self, going_on: Path | None = None) -> list[str]:
-        """Delete the oldest of too many runs, but not the one that is `going_on`; returns their names."""
+        """Delete the oldest surplus runs, except `going_on`; returns their names."""
         aside = sorted(self.folder.glob(f"*{ASIDE}"), reverse=True)
         waiting = sorted(self._runs(), reverse=True)[WAITING_MAX:]
         removed = aside[ASIDE_MAX:] + [folder for folder in waiting if folder != going_on]

@@ -1,1 +1,1 @@
-"""The report of a calibration: one HTML and one PDF file that a lab keeps. Knows no ROS."""
+"""The report of a calibration: one HTML and one PDF file for the records of a lab. Independent of ROS."""

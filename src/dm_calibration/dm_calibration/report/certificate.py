@@ -1,5 +1,5 @@
-"""The two pages of the report that one hangs up: what the calibration promises, until when, and who says so; and a
-picture of every actuator.
+"""The first two pages of the report: the certificate (promise, term of validity, names), and a picture of every
+actuator.
 """
 
 import json
@@ -25,18 +25,18 @@ from dm_common.limits import Limits
 from dm_common.optics.conic import conic_coefficients, curvatures_text, reachable_range
 from dm_common.optics.zernike import PISTON_TILT
 
-#: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
+#: File with the names of operator and instrument, set once by `./dm report --operator NAME --instrument NAME`.
 PEOPLE = Path("~/.ros/dm_report.json")
-#: A curvature is in the range while no coefficient is further off than this, m; it is found to this, 1/m.
+#: Largest predicted coefficient error of a curvature in the range, m; resolution of the limits of the range, 1/m.
 TOLERANCE, STEP = 20e-9, 1e-4
-#: So many spheres over the range tell what is predicted of most.
+#: Number of spheres over the range from which the median predicted error is found.
 SPHERES = 11
-#: Weight of the signals beside the coefficients, relative: makes the signals of more actuators than terms definite.
+#: Relative weight of the signals in the fit of a shape: makes it definite with more actuators than terms.
 RIDGE = 1e-9
 
 
 def people(file: Path = PEOPLE) -> dict[str, str]:
-    """Names of `operator` and `instrument`, as far as they were given."""
+    """Names of `operator` and `instrument`, as far as they are known."""
     try:
         content = json.loads(file.expanduser().read_text())
     except (OSError, ValueError):
@@ -45,7 +45,7 @@ def people(file: Path = PEOPLE) -> dict[str, str]:
 
 
 def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
-    """Keep the names that are given for this report and those to come; "" = none, and not asked for again.
+    """Keep the given names for this report and later ones; "" = no name, which is not asked for again.
 
     Raises:
         OSError: the file cannot be written.
@@ -55,10 +55,10 @@ def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
 
 
 def spheres(calibration: Calibration) -> tuple[float, float, float]:
-    """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach whatever the actuators went
-    through before, and the largest coefficient error (m) that is predicted of one of them, in the median.
+    """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach for any history of the
+    actuators, and the median over such spheres of the largest predicted coefficient error (m).
 
-    (nan, nan, nan) where neither 0 nor the curvature in mid range is reached.
+    (nan, nan, nan) if neither 0 nor the curvature at mid range is reached.
     """
     fit, maps, radius = calibration.fit, calibration.maps, calibration.aperture_radius
     pairs = neighbour_pairs(calibration.actuator_x, calibration.actuator_y)
@@ -87,13 +87,13 @@ def certificate(
     values: Mapping[str, Any] = JUDGED_BY,
     since: Sequence[str] = (),
 ) -> Section:
-    """Verdict, range, promise, term and names.
+    """Verdict, range, promise, validity and names.
 
     Args:
         names: of `operator` and `instrument`.
-        checks: since then, oldest first.
+        checks: made since the calibration, oldest first.
         values: of the parameters named in JUDGED_BY.
-        since: what checks have shown that it holds no more, or in part only: sentences.
+        since: sentences on why, by later checks, the calibration no longer holds, or only in part.
     """
     reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]
     bound = length(calibration.promise, calibration.wavelength)

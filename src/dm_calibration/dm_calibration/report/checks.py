@@ -1,4 +1,4 @@
-"""Text of the report: what checks have shown since the calibration, what drifts, how fast, until when it is valid."""
+"""Text of the report: results of checks since the calibration, drift and its rate, and the term of validity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,23 +14,23 @@ from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Picture, Section, Table
 
 DAY_S = 86400.0
-#: Fewest checks, and least time between the first and the last, that show a trend.
+#: Fewest checks, and least time (s) between the first and the last, from which a trend is computed.
 TREND_MIN, TREND_SPAN_S = 5, DAY_S
-#: Checks in the table: the last ones.
+#: Number of checks in the table, the latest ones.
 SHOWN = 20
 
 
 def valid_until(
     checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = JUDGED_BY
 ) -> tuple[float, str]:
-    """Until when a calibration is valid, s since the epoch, and why; the next is to be made by then.
+    """Time until which a calibration is valid, s since the epoch, and the reason; a new one is due by then.
 
-    The trend is the median of all slopes between two checks; it counts where its 90 % interval is above zero.
+    The trend is the median of all slopes between two checks; it counts if its 90 % interval is above zero.
 
     Args:
         checks: oldest first.
         promised: 95 % bound on the largest coefficient error, m.
-        measured_s: time of the last map of the calibration.
+        measured_s: time of the last map of the calibration, s since the epoch.
         values: of the parameters named in JUDGED_BY.
     """
     agreed = [check.time for check in checks if check.accepted]
@@ -49,7 +49,7 @@ def valid_until(
 
 
 def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = JUDGED_BY) -> Section:
-    """Table, chart and a sentence on each question.
+    """Table, chart, and sentences on agreement, drift and validity.
 
     Args:
         checks: at least one, oldest first.

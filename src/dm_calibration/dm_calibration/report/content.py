@@ -1,4 +1,4 @@
-"""Text of the report, part one: what it comes to, what was measured with what, what to beware of, every map."""
+"""Text of the report, part one: key figures, provenance, warnings and limitations, all maps, files."""
 
 import time
 from collections import Counter
@@ -12,9 +12,9 @@ from dm_calibration.report.document import Section, Table
 from dm_common.figures import with_wavelengths
 
 NM = 1e9
-#: What the sentences of a poke check begin with.
+#: Prefix of the sentences from a poke check.
 POKE_CHECK = "Poke check: "
-#: Hexadecimal digits of a file's SHA-256 that the table of maps shows.
+#: Number of hexadecimal digits of a file's SHA-256 shown in the table of maps.
 SHA_SHOWN = 12
 
 
@@ -24,19 +24,19 @@ def utc(time_ns: int) -> str:
 
 
 def length(metres: float, wavelength: float) -> str:
-    """A length in nm, and as a share of the wavelength where that is known."""
+    """A length in nm, and as a fraction of the wavelength if that is known."""
     if not np.isfinite(metres):
         return "not known"
     return with_wavelengths(f"{metres * NM:.2f} nm", metres, wavelength)
 
 
 def _counted(number: int, one: str, many: str) -> str:
-    """A number with its noun."""
+    """A number with its noun in the singular or plural."""
     return f"{number or 'No'} {one if number <= 1 else many}"
 
 
 def summary(calibration: Calibration) -> Section:
-    """What a user must know first."""
+    """What a user needs to know first."""
     fit, hysteresis, wavelength = calibration.fit, calibration.hysteresis, calibration.wavelength
     grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
     recipes = [recipe.max_zernike for recipe in calibration.recipes.recipes]
@@ -155,7 +155,7 @@ def files(calibration: Calibration, file: str, sha256: str) -> Section:
     """Files and their hashes.
 
     Args:
-        file: name of the calibration's; "" = not stored.
+        file: name of the calibration file; "" = not stored.
     """
     maps = calibration.maps
     rows = [

@@ -20,14 +20,14 @@ from dm_common.optics.zernike import NAMES, PISTON_TILT
 
 
 def residuals(calibration: Calibration) -> MapSet:
-    """The maps that entered the fit, with what it leaves of their sag (0 where a map has no data) and coefficients, m.
+    """The maps used in the fit, with the residuals of their sag (0 where a map has no data) and coefficients, m.
 
-    Measured less influence function times signals less the figure as it drifted, piston and tilt removed; `applied` are
-    effective signals where the calibration holds a hysteresis model. The figure is found again from the residuals: with
-    the influence function given, its values at the reference frames are the same least-squares problem as in the fit.
+    A residual is the measured value less influence function times signals less the drifting figure, without piston and
+    tilt; `applied` holds effective signals if there is a hysteresis model. The figure is found again from the
+    residuals: for a given influence function, its values at the reference frames solve the same least-squares problem.
 
     Raises:
-        TooFewMapsError, ValueError: maps that no fit can be made of; those of a stored calibration can.
+        TooFewMapsError, ValueError: maps that do not allow a fit, which those of a stored calibration do.
     """
     fit, maps = calibration.fit, calibration.maps
     if calibration.hysteresis is not None:

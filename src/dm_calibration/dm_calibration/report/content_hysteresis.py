@@ -11,24 +11,24 @@ from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook, recipe_row
 
-#: Minor loops: from the falling branch, down to each of these and back, as shares of half the range.
+#: Minor loops, in shares of half the range: turning points on the falling branch, and the rise from each and back.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
 MINOR_DEPTH = 0.5
 #: Times after a step, s.
 CREEP_TIMES = np.geomspace(0.1, 1e5, 61)
-#: From when on creep is counted, s.
+#: Time after a step from which on its growth counts as creep, s.
 CREEP_FROM = 1.0
 
 
 def loop_opening(law: HysteresisModel, low: float, high: float) -> Floats:
-    """(N,) largest distance of the branches of a cycle of `low` .. `high`, as a share of its span, of each law."""
+    """(N,) largest distance between the branches of a cycle `low` .. `high`, as a share of its span, for each law."""
     return opening(*closed_cycle(law, low, high)[1:])
 
 
 def step_response(law: HysteresisModel, time: Floats) -> Floats:
-    """Effective signal `time` (T,) s after a step from 0 to +1 on a rested mirror, relative to that after 1 s.
+    """Effective signal `time` (T,) s after a step from 0 to +1 on a rested mirror, relative to its value after 1 s.
 
-    The mean over actuators whose laws are their own.
+    With a law per actuator: the mean over actuators.
     """
     state = turned(law, (1.0,))
     grown = np.array([law.effective(law.advance(state, float(when))).mean() for when in time])
@@ -36,9 +36,9 @@ def step_response(law: HysteresisModel, time: Floats) -> Floats:
 
 
 def loops_figure(law: HysteresisModel, low: float, high: float) -> Figure:
-    """The loop of `low` .. `high` with minor loops in it; beside it what remains without the straight line.
+    """The loop `low` .. `high` with minor loops; beside it the deviation from the straight line.
 
-    The mean over actuators whose laws are their own.
+    With a law per actuator: the mean over actuators.
     """
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""A document of sections with paragraphs, tables and pictures. Knows nothing of mirrors, HTML or PDF."""
+"""A document of sections with paragraphs, tables and pictures. Independent of mirrors, HTML and PDF."""
 
 import io
 from collections.abc import Sequence
@@ -7,18 +7,18 @@ from functools import cached_property
 
 from matplotlib.figure import Figure
 
-#: Colours that stay apart for colour-blind readers [28].
+#: Colours that colour-blind readers can distinguish [28].
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
 SKY_BLUE, YELLOW = "#56B4E9", "#F0E442"
-#: For sag about zero: dark at both ends, light in the middle, safe for colour-blind readers.
+#: Colour map for sag about zero: dark at both ends, light in the middle, safe for colour-blind readers.
 DIVERGING = "RdBu_r"
-#: Of pictures; on paper, where they are smaller than on a screen, some 200.
+#: Resolution of pictures on the screen, dots per inch; on paper, where they are smaller, it is about 200.
 DPI = 130
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; the first column is a name, the others are numbers, set to the right, unless `textual`.
+    """Rows under a header; the first column holds names, the others right-aligned numbers, or texts if `textual`.
 
     Raises:
         ValueError: a row of another length than the header.
@@ -53,7 +53,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading with paragraphs, then tables, then pictures; a `sheet` is a page by itself on paper, and fits on it."""
+    """A heading with paragraphs, then tables, then pictures; a `sheet` is printed on a page of its own, and fits it."""
 
     title: str
     paragraphs: Sequence[str]

@@ -19,9 +19,9 @@ from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 
 NM, MM = 1e9, 1e3
-#: Pixels across a small map.
+#: Width of a small map, pixels.
 PIXELS = 61
-#: Small maps in a row.
+#: Number of small maps in a row.
 COLUMNS = 7
 KIND_COLOURS: dict[str, str] = dict(
     zip(
@@ -52,7 +52,7 @@ def influence_sheet(calibration: Calibration) -> Figure:
     maps = on_disc(fit.influence_sag.T, fit.points) * NM
     radius = calibration.aperture_radius * MM
     rows = -(-len(maps) // COLUMNS)
-    # One pair of axes for all, a map beside the next: axes for each would take ten times as long as all the rest.
+    # All maps in one pair of axes: axes for each map would take ten times as long as all the rest.
     across, down = 2.2 * radius, 2.7 * radius
     columns, lines = across * np.arange(COLUMNS), -down * np.arange(rows)
     figure = Figure(figsize=(10.5, 1.45 * rows + 0.7), layout="constrained")
@@ -63,7 +63,7 @@ def influence_sheet(calibration: Calibration) -> Figure:
         left, bottom, right, top = *(centre - radius), *(centre + radius)
         image = axes.imshow(sag, origin="lower", extent=(left, right, bottom, top), cmap=DIVERGING, norm=scale)
         axes.add_patch(Circle(tuple(centre), radius, fill=False, edgecolor=GREY, linewidth=0.6))
-        # Of an actuator outside the aperture, the direction shows.
+        # For an actuator outside the aperture only the direction is shown.
         place = np.array([calibration.actuator_x[number], calibration.actuator_y[number]]) * MM
         distance = max(float(np.hypot(*place)), 1e-12)
         outside = distance > radius
@@ -164,7 +164,7 @@ def regions_figure(regional: Floats, labels: Sequence[str]) -> Figure:
 
 
 def coefficients_figure(rms: Floats, hysteresis_sigma: Floats | None) -> Figure:
-    """`rms` residual (K,) of each Zernike coefficient, beyond tilt; beside it what held-out moves showed, if known."""
+    """`rms` residual (K,) of each Zernike coefficient beyond tilt, and the error of held-out moves if known."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     axes = figure.add_subplot()
     first = PISTON_TILT

@@ -1,4 +1,4 @@
-"""A document as HTML: a page with its pictures beside it, or one file with all in it."""
+"""A document as HTML: one file with embedded pictures, or a page with picture files beside it."""
 
 import base64
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ def _as_data(picture: Picture) -> str:
 
 
 def html_page(title: str, sections: Sequence[Section], place: Callable[[Picture], str] = _as_data) -> str:
-    """The page; `place` puts a picture somewhere and returns its address. By default they are inside, all one file."""
+    """The HTML page; `place` stores a picture and returns its address. By default pictures are embedded in the page."""
     parts, links = [], []
     for number, section in enumerate(sections, start=1):
         links.append(f'<a href="#s{number}">{escape(section.title)}</a>')

@@ -24,7 +24,7 @@ from dm_common.atomic_write import write_whole
 def sections(
     calibration: Calibration, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
 ) -> list[Section]:
-    """All sections of the report of `calibration`, which was read from `file`; `values` of what it is judged by.
+    """All sections of the report of `calibration`, read from `file`; `values` of the parameters named in JUDGED_BY.
 
     Raises:
         OSError: `file` cannot be read.
@@ -60,14 +60,14 @@ def sections(
 def write_report(
     calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
 ) -> tuple[Path, Path]:
-    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each whole or not at all; returns the two files.
+    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each atomically; returns the two files.
 
     Args:
-        file: that the calibration was read from, for its SHA-256.
-        values: of the parameters that it is judged by, JUDGED_BY.
+        file: from which the calibration was read, for its SHA-256.
+        values: of the parameters named in JUDGED_BY.
 
     Raises:
-        OSError: `file` cannot be read, or `folder` not written to.
+        OSError: `file` cannot be read, or `folder` cannot be written to.
     """
     made = sections(calibration, file, values)
     title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
@@ -78,7 +78,7 @@ def write_report(
 
 
 def figures_of(calibration: Calibration) -> dict[str, Any]:
-    """The main figures, for programs."""
+    """The key figures as a dictionary, for use by programs."""
     fit, hysteresis = calibration.fit, calibration.hysteresis
     names, counts = np.unique([GRADE_NAMES[grade] for grade in fit.grades], return_counts=True)
     result: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""A document as PDF on A4 pages, set by ReportLab."""
+"""A document as PDF on A4 pages, made with ReportLab."""
 
 import io
 from collections.abc import Sequence
@@ -32,21 +32,21 @@ from reportlab.platypus import (
 
 from dm_calibration.report.document import Picture, Section, Table
 
-#: Lengths in points, 1/72 inch.
+#: Margin and text width of a page; lengths in points, 1/72 inch.
 MARGIN = 48.0
 WIDTH = A4[0] - 2 * MARGIN
 #: Tallest picture: the page less margins and room for a caption.
 HEIGHT = A4[1] - 2 * MARGIN - 60.0
 #: Room for text on a page, less the frame's own padding.
 PAGE = A4[1] - 2 * MARGIN - 12.0
-#: Around the text of a cell.
+#: Padding around the text of a cell.
 PADDING = 4.0
-#: Widest column of numbers whose text is not broken over lines, as a share of the page.
+#: Largest width of a column, as a share of the page, before its text is broken over lines.
 COLUMN_MAX = 0.38
 TABLE_SIZE = 8.0
 FOOT = HexColor("#444444")
 RULE = HexColor("#dddddd")
-#: The fonts of the figures: they have the Greek letters and signs of the text, which the PDF standard fonts lack.
+#: The fonts of the figures: they have the Greek letters and signs of the text, which the standard PDF fonts lack.
 REGULAR, BOLD = "DejaVuSans", "DejaVuSans-Bold"
 
 TITLE = ParagraphStyle("title", fontName=BOLD, fontSize=15, leading=19, spaceAfter=10)
@@ -60,11 +60,11 @@ TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, s
 
 
 def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
-    """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
+    """All sections as a PDF: text, tables and pictures one below the other, with title and page number at the foot."""
     _register_fonts()
-    rl_config.useA85 = 0  # pictures as bytes: as text they are a quarter larger, and take time to be made so
+    rl_config.useA85 = 0  # pictures as binary: as text (ASCII 85) they are a quarter larger and slower to encode
     stream = io.BytesIO()
-    # Invariant: without a date, the same run gives the same file.
+    # Invariant: the file contains no date, so that the same content gives the same file.
     margins = dict.fromkeys(("leftMargin", "rightMargin", "topMargin", "bottomMargin"), MARGIN)
     document = SimpleDocTemplate(stream, pagesize=A4, title=title, invariant=1, **margins)
     story: list[Flowable] = []
@@ -76,7 +76,7 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
         shown = [*map(_table, section.tables), *map(_picture, section.pictures)]
         if section.sheet:
             story += [KeepInFrame(WIDTH, PAGE, [*text, *chain(*shown)], mode="shrink"), PageBreak()]
-        elif shown:  # on the page of the heading, or from the next one on
+        elif shown:  # together with the heading, if necessary on the next page
             story += [KeepTogether([*text, *shown[0]]), *map(KeepTogether, shown[1:])]
         else:
             story += text
@@ -95,14 +95,14 @@ def _paragraph(text: str, style: ParagraphStyle) -> Paragraph:
 
 
 def _picture(picture: Picture) -> list[Flowable]:
-    """A picture as wide as the text, or as high as a page, with its caption below it."""
+    """A picture with its caption below, as wide as the text or as high as the page."""
     width, height = (72.0 * length for length in picture.figure.get_size_inches())
     scale = min(WIDTH / width, HEIGHT / height)
     return [Image(io.BytesIO(picture.png), width * scale, height * scale), _paragraph(picture.caption, CAPTION)]
 
 
 def _table(table: Table) -> list[Flowable]:
-    """A table whose columns are as wide as their longest cell, in a smaller type where they need more than the page."""
+    """A table with columns as wide as their longest cell, in a smaller type if they are wider than the page."""
     widths = _column_widths(table)
     scale = min(1.0, WIDTH / sum(widths))
     size, padding = scale * TABLE_SIZE, scale * PADDING
@@ -137,9 +137,9 @@ def _table(table: Table) -> list[Flowable]:
 
 
 def _column_widths(table: Table) -> list[float]:
-    """Widths of the columns at full type size, points: room for the longest cell, as long as all fit on the page.
+    """Widths of the columns at full type size, points: that of the longest cell if all columns fit on the page.
 
-    Else headings take several lines, then long texts as well; numbers never do.
+    Otherwise headings are broken over lines, then long texts as well, but never numbers.
     """
     longest = [max(_cell_width(row[k], REGULAR) for row in table.rows) for k in range(len(table.header))]
     headings = [_cell_width(heading, BOLD) for heading in table.header]
@@ -149,7 +149,7 @@ def _column_widths(table: Table) -> list[float]:
         widths = [max(pair) for pair in zip(longest, narrow, strict=True)]
     if sum(widths) > WIDTH:
         widths = [min(width, COLUMN_MAX * WIDTH) for width in widths]
-        if table.textual:  # its last column says most, and may be broken
+        if table.textual:  # the last column has the longest texts, which may be broken
             widths[-1] = max(widths[-1], WIDTH - sum(widths[:-1]))
     return widths
 
@@ -159,7 +159,7 @@ def _cell_width(text: str, font: str) -> float:
 
 
 def _numbered(title: str) -> type[Canvas]:
-    """A canvas that writes the title and "page 2 of 7" at the foot of each page: once all of them are there."""
+    """A canvas that writes the title and "page 2 of 7" at the foot of each page, once all pages are finished."""
 
     class NumberedCanvas(Canvas):
         def __init__(self, *arguments: Any, **options: Any) -> None:

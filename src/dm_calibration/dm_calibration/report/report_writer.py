@@ -1,7 +1,7 @@
-"""The report beside each calibration file: ``<id>.html`` and ``<id>.pdf``, written by a process of its own.
+"""The report beside each calibration file: ``<id>.html`` and ``<id>.pdf``, written by a separate process.
 
-A report takes some seconds of drawing, which must hold up neither the node nor the result of its action; and whatever
-goes wrong with it, the calibration is stored already. `./dm report` writes the same files at any time.
+Drawing a report takes some seconds, which must delay neither the node nor the result of its action. If it fails, the
+calibration is stored nevertheless. `./dm report` writes the same files at any time.
 """
 
 import contextlib
@@ -18,18 +18,18 @@ from typing import Any
 from dm_calibration.calibration_parameters import JUDGED_BY
 from dm_calibration.store.calibration_store import CalibrationStore
 
-#: Longest time for one report, s of wall time; a loaded machine may need a multiple of the usual few.
+#: Time limit for one report, s of wall time; on a loaded machine it may take many times the usual few seconds.
 TIMEOUT_S = 300.0
-#: A report must not take time from a bench that measures.
+#: Niceness of the process: a report must not take computing time from a bench that measures.
 NICENESS = 15
 
 
 class ReportWriter:
-    """Writes one report after the other; of one calibration that changes meanwhile, only the last state.
+    """Writes one report after the other; if a waiting calibration changes again, only its last state is reported.
 
     Args:
-        publish: called with a sentence and whether it is a warning, from a thread of its own.
-        values: of the node's parameters; those of JUDGED_BY count as they are when a report is begun.
+        publish: called with a sentence and whether it is a warning, from the thread of the writer.
+        values: of the node's parameters; those of JUDGED_BY are read when a report is begun.
     """
 
     def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = JUDGED_BY) -> None:
@@ -41,14 +41,14 @@ class ReportWriter:
         self._ended = False
 
     def write(self, file: Path) -> None:
-        """Have the report of the calibration in `file` written beside it; returns at once."""
+        """Start writing the report of the calibration in `file` beside it; returns at once."""
         with self._lock:
             if not self._ended and file not in self._waiting:
                 self._waiting.add(file)
                 self._worker.submit(self._work, file)
 
     def end(self) -> None:
-        """Stop: a report under way is given up, with no trace of it."""
+        """Stop: a report in progress is aborted and leaves no files."""
         with self._lock:
             self._ended = True
             if self._process is not None:
@@ -57,7 +57,7 @@ class ReportWriter:
         self.finish()
 
     def finish(self) -> None:
-        """Wait until all reports are done; no more are taken."""
+        """Wait until all reports are finished; no more are accepted."""
         self._worker.shutdown()
 
     def _work(self, file: Path) -> None:
@@ -97,8 +97,8 @@ class ReportWriter:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the report of the calibration file named in `arguments` beside it, judged by the parameters behind, in
-    JSON; returns the exit status.
+    """Write the report beside the calibration file `arguments`[0], judged by the parameters in `arguments`[1] (JSON);
+    returns the exit status.
     """
     from dm_calibration.report.page import write_report
 

@@ -1,1 +1,1 @@
-"""Calibration files: HDF5 read in a process of its own, written whole or not at all."""
+"""Calibration files: HDF5, read in a separate process, written atomically."""

@@ -1,4 +1,4 @@
-"""The folder of calibration files: written whole or not at all, read with suspicion."""
+"""The folder of calibration files: written atomically, checked thoroughly when read."""
 
 import re
 import time
@@ -13,14 +13,14 @@ from dm_common.atomic_write import StoreError, storing, write_whole
 from dm_common.errors import UnknownNameError
 
 SUFFIX = ".h5"
-#: What was measured, and where: never changed after a calibration was stored.
+#: Prefixes of the raw data (maps, sampling points, mirror), which never change once a calibration is stored.
 _RAW = ("maps/", "points/", "mirror/")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of the folder: its calibration, or the reason why there is none."""
+    """One file of the folder: its calibration, or the reason why it cannot be read."""
 
     id: str
     file: Path
@@ -29,14 +29,14 @@ class Entry:
 
 
 def new_id(mirror_name: str, serial: str, created_ns: int) -> str:
-    """An id of mirror, serial number and time (UTC)."""
+    """An id made from mirror, serial number and time (UTC)."""
     parts = [_stem(part) for part in (mirror_name, serial)]
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
     return "_".join([part for part in parts if part] + [stamp])
 
 
 def _stem(text: str) -> str:
-    """What of `text` may stand in a file name."""
+    """`text` reduced to characters that are safe in a file name."""
     return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-")[:32]
 
 
@@ -44,7 +44,7 @@ class CalibrationStore:
     """Calibrations of one folder, one file ``<id>.h5`` each.
 
     Args:
-        written: called with each file that was stored or replaced.
+        written: called with each file that is stored or replaced.
     """
 
     def __init__(self, folder: str | Path, written: Callable[[Path], None] = lambda file: None) -> None:
@@ -58,11 +58,11 @@ class CalibrationStore:
         return next(identifier for identifier in candidates if not self._file(identifier).exists())
 
     def save(self, calibration: Calibration) -> Path:
-        """Write `calibration` to ``<id>.h5``: to a temporary file beside it first, then under its name in one step.
+        """Write `calibration` to ``<id>.h5``: to a temporary file beside it, which is then renamed in one step.
 
         Raises:
-            StoreError: disk full, read-only, id taken, ...; the folder is as it was.
-            ValueError: an id that is no safe file stem.
+            StoreError: disk full, read-only, id taken, ...; the folder is unchanged.
+            ValueError: the id is not a safe file stem.
         """
         if not _ID.fullmatch(calibration.id):
             raise ValueError(
@@ -75,12 +75,12 @@ class CalibrationStore:
         return target
 
     def replace(self, calibration: Calibration) -> Path:
-        """Write `calibration` over the file of its id, in one step: until the new file is whole the old one stays.
+        """Replace the file of `calibration` in one step: the old file stays until the new one is complete.
 
         Raises:
-            StoreError: disk full, read-only, other raw data than in the file, ...; the old file is as it was.
+            StoreError: disk full, read-only, raw data differ from those in the file, ...; the old file is unchanged.
             UnknownNameError: there is no such file.
-            CalibrationFileError: the old file is damaged: it is not overwritten.
+            CalibrationFileError: the old file is damaged and is not overwritten.
         """
         target = self.find(calibration.id)
         if raw_hash(self.load(calibration.id)) != raw_hash(calibration):
@@ -95,7 +95,7 @@ class CalibrationStore:
         self._written(target)
 
     def note_in_use(self, calibration: Calibration) -> None:
-        """Keep on disk that its mirror uses this one, for the next start. Raises StoreError."""
+        """Record on disk, for the next start, that the mirror uses `calibration`. Raises StoreError."""
         if self.last_in_use(calibration.mirror_serial) != calibration.id:
             with storing(f"{calibration.id} is in use, but the next start will not know"):
                 write_whole(self._in_use(calibration.mirror_serial), calibration.id.encode())
@@ -137,7 +137,7 @@ class CalibrationStore:
             path = Path(name).expanduser()
         except RuntimeError as error:
             raise UnknownNameError(f"calibration {name!r}: {error}") from error
-        if path.name != name:  # a path: only one that is a file of this folder
+        if path.name != name:  # a path is accepted only if it names a file of this folder
             inside = path.suffix == SUFFIX and path.parent.resolve() == self.folder.resolve()
             if not inside:
                 raise UnknownNameError(f"calibration {name!r}: must be an id or a file of {self.folder}")
@@ -152,7 +152,7 @@ class CalibrationStore:
         return file
 
     def entries(self) -> list[Entry]:
-        """All files of the folder, newest first by creation; damaged ones with the reason, by their file time."""
+        """All files of the folder, newest first by creation; damaged ones, with the reason, by modification time."""
         listed = []
         for file in self.folder.glob(f"*{SUFFIX}") if self.folder.is_dir() else []:
             if file.name.startswith("."):
@@ -173,6 +173,6 @@ class CalibrationStore:
 
 
 def raw_hash(calibration: Calibration) -> str:
-    """Of what was measured, and where: equal only when every bit is."""
+    """Hash over the raw data: equal only if every bit is."""
     columns = to_columns(calibration)[0]
     return content_hash({name: values for name, values in columns.items() if name.startswith(_RAW)}, {})

@@ -1,7 +1,7 @@
-"""Plain arrays, texts and attributes to and from an HDF5 file image, with a hash over the content.
+"""Conversion of plain arrays, texts and attributes to and from an HDF5 file image, with a hash over the content.
 
-The file is made in memory, so that a full disk meets ordinary file writing, which reports it, rather than the HDF5
-library in the middle of its own bookkeeping.
+The file is made in memory, so that a full disk is reported by ordinary file writing instead of failing inside the HDF5
+library.
 """
 
 import hashlib
@@ -24,22 +24,22 @@ Attribute = bool | int | float | str | tuple[str, ...]
 
 #: Attribute that holds the hash over everything else.
 HASH = "content_sha256"
-#: Larger files are not calibrations [bytes].
+#: Largest accepted file, far above the size of a calibration [bytes].
 SIZE_MAX = 1 << 28
-#: Size of the smallest superblock that such a file begins with [bytes].
+#: Size of the smallest superblock at the start of such a file [bytes].
 SUPERBLOCK = 96
-#: More groups and datasets than this are not a calibration, but perhaps a loop.
+#: Most groups and datasets that are accepted; more hint at a loop in a damaged file.
 _OBJECTS_MAX = 1000
 
 _TEXT = h5py.string_dtype("utf-8")
 
 
 class ImageError(ValueError):
-    """The file is not a whole, plain HDF5 file whose content agrees with its hash."""
+    """The file is not a complete, plain HDF5 file whose content matches its hash."""
 
 
 def write_image(columns: Mapping[str, Column], attributes: Mapping[str, Attribute]) -> bytes:
-    """The bytes of an HDF5 file with `columns` by path and `attributes` of the root, and their hash."""
+    """The bytes of an HDF5 file with `columns` by path and `attributes` at the root, including their hash."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         for name, value in columns.items():
@@ -59,11 +59,11 @@ def write_image(columns: Mapping[str, Column], attributes: Mapping[str, Attribut
 def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
     """Columns and attributes of a file written by :func:`write_image`.
 
-    The HDF5 library runs in a process of its own (see :mod:`dm_calibration.store.hdf5_sandbox`), and only plain
-    datasets are read: links out of the file, virtual and external storage are refused.
+    The HDF5 library runs in a separate process (see :mod:`dm_calibration.store.hdf5_sandbox`), and only plain datasets
+    are read: links out of the file, virtual datasets and external storage are refused.
 
     Raises:
-        ImageError: it cannot be read, is not HDF5, truncated, damaged, not plain, or the hash does not agree.
+        ImageError: unreadable, not HDF5, truncated, damaged, not plain, or the hash does not match.
     """
     try:
         with path.open("rb") as raw:
@@ -73,7 +73,7 @@ def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
             content = raw.read(size)
     except OSError as error:
         raise ImageError(f"cannot be read: {error.strerror or error}") from error
-    if size < SUPERBLOCK:  # the library would read on into whatever lies behind
+    if size < SUPERBLOCK:  # the library would read beyond the end of the buffer
         raise ImageError(f"not a whole HDF5 file: {size} bytes, must be {SUPERBLOCK} at least")
     try:
         answer = read_in_sandbox("image", content)
@@ -92,12 +92,12 @@ def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
 
 
 def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Texts as tuples again, which JSON hands over as lists."""
+    """Lists of texts, into which JSON turns tuples, as tuples again."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def parse_image(content: bytes) -> tuple[dict[str, Column], dict[str, Attribute]]:
-    """Columns and attributes of an HDF5 image, the hash unchecked. Damaged files may crash the process.
+    """Columns and attributes of an HDF5 image, without checking the hash. Damaged files may crash the process.
 
     Raises:
         ImageError: not HDF5, truncated, damaged, or not plain.
@@ -139,12 +139,12 @@ def content_hash(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
 
 
 def _bytes(text: str) -> bytes:
-    """UTF-8; h5py hands over bytes that are none, in names and attributes of a damaged file, as lone surrogates."""
+    """UTF-8 bytes; invalid bytes in names and attributes of a damaged file arrive from h5py as lone surrogates."""
     return text.encode("utf-8", "surrogatepass")
 
 
 def _datasets(file: h5py.File, length: int) -> Iterator[tuple[str, h5py.Dataset]]:
-    """All datasets by path. What they hold must stand in the file of `length` bytes, so that no claim costs memory."""
+    """All datasets by path; their data must fit into the `length` bytes of the file, which bounds memory use."""
     size = objects = 0
     groups: list[tuple[str, h5py.Group]] = [("", file)]
     while groups:

@@ -1,9 +1,9 @@
-"""Reading HDF5 in a process of its own: damaged files can crash the HDF5 library, or send it round in circles.
+"""Reading HDF5 in a separate process: damaged files can crash the HDF5 library or make it loop forever.
 
-The library is made for files it wrote itself. Bits flipped in a file's structure make it follow wild pointers, loop or
-allocate without bounds (seen with HDF5 2.0 in the fuzzing of :mod:`fault_injection`). So a helper process reads
-the bytes, within limits of memory and computing time, and hands back plain arrays and texts. When it dies, the file is
-damaged; the next file gets a new helper. The helper ends with the process that started it.
+The library trusts the files it reads. Bits flipped in a file's structure make it follow wild pointers, loop or allocate
+without bounds (seen with HDF5 2.0 in the fuzzing of :mod:`fault_injection`). So a helper process reads the bytes, with
+limits on memory and computing time, and returns plain arrays and texts. If it dies, the file counts as damaged, and the
+next file gets a new helper. The helper ends with the process that started it.
 """
 
 import atexit
@@ -21,25 +21,25 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Computing time per file: a fixed part, and one by size [s, s/byte]. A 12-megapixel map takes 0.3 s.
+#: Limit of computing time per file: a fixed part [s] plus one by size [s/byte]. A 12-megapixel map takes 0.3 s.
 CPU_BASE_S = 1
 CPU_PER_BYTE_S = 2e-7
-#: Wall time after which the helper is given up, whatever it waits for [s].
+#: Wall time after which the helper is killed, whatever it waits for [s].
 WALL_LIMIT_S = 60.0
 
 _LENGTH = struct.Struct("<Q")
 _HEAD_MAX = 1 << 26
-#: Memory that the shared file may keep between two files, so that it need not be claimed anew [bytes].
+#: Memory that the shared file may keep between two files to save reallocating it [bytes].
 _KEPT = 1 << 24
 
 
 class SandboxError(Exception):
-    """The helper did not survive the file, or could not be started."""
+    """The helper died on the file, or could not be started."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the helper found: numbers and texts, arrays by name, or an error of the reader.
+    """Result of the helper: single values, arrays by name, or the error of the reader.
 
     Attributes:
         error, error_kind: the message and class name of the reader's exception; empty when it raised none.
@@ -76,14 +76,14 @@ class Hdf5Sandbox:
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._shared: FileIO | None = None  # in memory: contents go through it, for which a pipe would take longer
+        self._shared: FileIO | None = None  # file in memory through which contents pass; faster than a pipe
         atexit.register(self.close)
 
     def read(self, task: str, content: bytes) -> Answer:
         """Have `content` read by the reader `task` of :mod:`dm_calibration.map_files.hdf5_process`.
 
         Raises:
-            SandboxError: the helper died of it, took too long, or could not be started.
+            SandboxError: the helper died, took too long, or could not be started.
         """
         with self._turn:
             process, shared = self._running()
@@ -102,7 +102,7 @@ class Hdf5Sandbox:
                     arrays = {name: np.load(shared, allow_pickle=False) for name in head.pop("arrays")}
                     return Answer(arrays=arrays, **head)
             except (OSError, ValueError, MemoryError, EOFError):
-                pass  # told below, from how the helper ended
+                pass  # reported below, with the exit status of the helper
             finally:
                 watchdog.cancel()
                 if os.fstat(shared.fileno()).st_size > _KEPT:
@@ -123,7 +123,7 @@ class Hdf5Sandbox:
             try:
                 self._shared = FileIO(os.memfd_create("hdf5"), "r+")
                 descriptor = self._shared.fileno()
-                # A session of its own: Ctrl-C on the terminal is for the node, which ends the helper with itself.
+                # A session of its own: Ctrl-C in the terminal reaches only the node, which ends the helper itself.
                 self._process = subprocess.Popen(
                     [sys.executable, "-m", "dm_calibration.map_files.hdf5_process", str(descriptor)],
                     pass_fds=[descriptor],
@@ -138,7 +138,7 @@ class Hdf5Sandbox:
         return self._process, self._shared
 
     def _end(self, process: subprocess.Popen[bytes]) -> str:
-        """End the helper; returns how it ended."""
+        """End the helper; return a sentence with its exit status."""
         self._process = None
         for stream in (process.stdin, process.stdout, self._shared):
             if stream is not None:
@@ -152,5 +152,5 @@ class Hdf5Sandbox:
         return f"reading it ended the helper process with status {status}"
 
 
-#: :meth:`Hdf5Sandbox.read` by the one helper of this process.
+#: :meth:`Hdf5Sandbox.read` of the one helper of this process.
 read_in_sandbox = Hdf5Sandbox().read

@@ -1,4 +1,4 @@
-"""Hysteresis model and recipes as datasets and attributes of a calibration file."""
+"""Conversion of hysteresis model and recipes to and from datasets of a calibration file."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
@@ -12,9 +12,9 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
-#: Of each recipe, always; its added terms are kept as a table.
+#: Columns that every recipe has; its additional Zernike terms are kept as a table.
 _RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model"))
-#: Single numbers of the book.
+#: Scalar fields of the recipe book.
 _BOOK = tuple(field.name for field in fields(RecipeBook) if field.name != "recipes")
 
 
@@ -37,7 +37,7 @@ def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
     """The hysteresis model in the datasets of a file; None when it has none.
 
     Raises:
-        KeyError, ValueError: something is missing or makes no sense.
+        KeyError, ValueError: something is missing or invalid.
     """
     if "memory/name" not in columns:
         return None
@@ -45,7 +45,7 @@ def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
     for field in fields(HysteresisModel):
         older = field.default is not MISSING or field.default_factory is not MISSING
         if older and f"memory/law/{field.name}" not in columns:
-            continue  # a file from before there was this field
+            continue  # an older file, written before this field existed
         value = np.asarray(columns[f"memory/law/{field.name}"], dtype=np.float64)
         values[field.name] = value if value.ndim else float(value)
     held_out, unknown, maps = np.asarray(columns["memory/figures"], dtype=np.float64)
@@ -73,7 +73,7 @@ def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
     """The recipe book in the datasets of a file.
 
     Raises:
-        KeyError, ValueError: something is missing or makes no sense.
+        KeyError, ValueError: something is missing or invalid.
     """
     if "recipes/curvature" not in columns:
         return NO_RECIPES

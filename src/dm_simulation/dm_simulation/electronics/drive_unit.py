@@ -20,12 +20,12 @@ FACTORY_GLOBAL_OFFSET = 0x2000
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """What is soldered, stored and plugged.
+    """Hardware, stored settings and wiring.
 
     Attributes:
         volts_min, volts_max: V at the actuator for signals -1 and +1.
         wiring: connector channel (0-based) that actuator 1, 2, ... is really connected to.
-        squared: whether signals count the square of the volts, as a membrane does.
+        squared: whether signals are linear in the square of the volts, as for a membrane.
     """
 
     channels: int = parameter(
@@ -50,7 +50,7 @@ class DriveUnit:
     After power-up every actuator is at 0 V, or as near as the DAC reaches.
 
     Raises:
-        ValueError: inconsistent configuration, naming the parameter.
+        ValueError: an inconsistent configuration; the message names the parameter.
     """
 
     def __init__(self, config: DriveConfig) -> None:
@@ -93,11 +93,11 @@ class DriveUnit:
 
     @property
     def _signal_range(self) -> tuple[float, float]:
-        """What signals -1 and +1 stand for: V, or V^2."""
+        """Quantity at signals -1 and +1: V, or V^2 if `squared`."""
         return self.config.volts_min**self._power, self.config.volts_max**self._power
 
     def take_edac40(self, frame: frames.EdacFrame) -> None:
-        """Carry out an EDAC40 frame. Only value frames belong to normal running; the others are counted."""
+        """Carry out an EDAC40 frame. Only value frames occur in normal operation; the others are counted."""
         if frame.command == frames.EDAC40_VALUE:
             self._codes[frame.channels] = frame.values
         else:
@@ -116,7 +116,7 @@ class DriveUnit:
             outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
 
     def take_shares(self, outputs: Array) -> None:
-        """Carry out a frame of a serial unit: all its channels (C,) as shares of the DAC's range."""
+        """Carry out a frame of a serial unit: its channels (C,) as shares of the DAC's range."""
         self.outputs[: len(outputs)] = outputs
 
     def actuator_volts(self) -> Array:

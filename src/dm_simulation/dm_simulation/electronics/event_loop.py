@@ -1,4 +1,4 @@
-"""One thread that waits on all sockets of the bench and owns everything their data changes."""
+"""One thread that waits on all sockets of the bench and owns everything that their data change."""
 
 import asyncio
 import socket
@@ -13,7 +13,7 @@ class EventLoop:
     """Calls handlers when their socket or descriptor is readable.
 
     Args:
-        on_error: told when a handler raised; the loop goes on.
+        on_error: called when a handler raised an exception; the loop continues.
     """
 
     def __init__(self, name: str, on_error: Callable[[Exception], None]) -> None:
@@ -32,7 +32,7 @@ class EventLoop:
         self._loop.remove_reader(endpoint)
 
     def run(self, task: Callable[[], T]) -> T:
-        """Run `task` in the loop's thread, after the data that had arrived by now, and return its value.
+        """Run `task` in the loop's thread, after all data that have arrived by now, and return its value.
 
         Raises:
             OSError: the loop is closed.
@@ -43,7 +43,7 @@ class EventLoop:
             raise OSError("the virtual electronics are closed")
 
         async def after_what_arrived() -> T:
-            # By now the loop has looked at the sockets once since this was handed in, and put their handlers behind it.
+            # The loop has polled the sockets since this was submitted; their handlers are queued next and run first.
             await asyncio.sleep(0)
             return task()
 

@@ -1,4 +1,4 @@
-"""A serial drive unit of one's own: its frames as its data sheet gives them, and the decoder of what arrives."""
+"""A custom serial drive unit: the format of its frames, as its data sheet gives it, and their decoder."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -26,7 +26,7 @@ CHECK_LENGTH: Final = {
 
 @dataclass(frozen=True)
 class FramedConfig:
-    """The unit's data sheet."""
+    """Frame format of the unit, from its data sheet."""
 
     channels: int = parameter(whole(0, 0, 4096), "Words in a frame of the serial unit; 0 = it is a USB DAC-40.")
     bits: int = parameter(whole(16, 1, 16), "Bits of a code of the serial unit.")
@@ -74,7 +74,7 @@ class FramedDecoder:
     """Finds frames in a stream.
 
     Raises:
-        ValueError: a description that makes no sense, naming the parameter.
+        ValueError: an inconsistent description; the message names the parameter.
     """
 
     def __init__(self, config: FramedConfig) -> None:
@@ -105,7 +105,7 @@ class FramedDecoder:
         no whole frame yet.
 
         Raises:
-            FrameError: bytes that are no frame; they are taken off too.
+            FrameError: bytes that are not a frame; they are removed as well.
         """
         if self._opening and stream.startswith(self._opening):
             del stream[: len(self._opening)]

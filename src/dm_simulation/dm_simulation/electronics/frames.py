@@ -1,4 +1,4 @@
-"""Decoders of what arrives on the wire, written from the units' protocol descriptions."""
+"""Decoders of the bytes on the wire, written from the units' protocol descriptions."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ DAC40_FULL_SCALE = 4095
 
 
 class FrameError(ValueError):
-    """Bytes that are no frame; the message says why."""
+    """Bytes that are not a valid frame; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def take_dac40(stream: bytearray) -> NDArray[np.float64] | None:
     no whole frame yet. An opening block is taken off too.
 
     Raises:
-        FrameError: bytes that are no frame, which are taken off up to the next start byte, as the unit does.
+        FrameError: bytes that are not a frame, which are removed up to the next start byte, as the unit does.
     """
     while len(stream) >= DAC40_FRAME:
         try:

@@ -1,4 +1,4 @@
-"""A watch on every frame, independent of the driver's own limiter: what really reached the actuators."""
+"""A check of every frame, independent of the driver's own limiter, by the signals that really reached the actuators."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from dm_simulation.mirror.zernike import Array
 
 @dataclass(frozen=True)
 class MonitorConfig:
-    """Limits in normalised signals; the largest values are recorded whatever is counted."""
+    """Limits of normalised signals, beyond which frames are counted; the extremes are recorded in any case."""
 
     jump: float = parameter(real(0.1, 0.0, 4.0), "Counted: change per frame above this; 0 = off.")
     neighbour_difference: float = parameter(
@@ -41,7 +41,7 @@ class Record:
 
 
 class Monitor:
-    """Compares each frame's signals with those before it.
+    """Compares the signals of each frame with those before it.
 
     Args:
         pairs: (P, 2) neighbouring actuators.
@@ -55,7 +55,7 @@ class Monitor:
         self._last = initial.copy()
 
     def watch(self, signals: Array) -> str:
-        """Take the signals (N,) after a frame; return what was wrong with them, "" when nothing was."""
+        """Take the signals (N,) after a frame; return which limits they broke, "" if none."""
         config, record = self.config, self.record
         record.frames += 1
         jumps = np.abs(signals - self._last)

@@ -16,14 +16,14 @@ class SerialTerminal:
     """Carries out the frames that a client writes to the terminal.
 
     Args:
-        unit: what the frames set.
+        unit: the drive unit that the frames set.
         framed: frames of the unit; without channels it is a USB DAC-40.
-        loop: runs everything but the making of this object.
+        loop: runs everything except the constructor.
         on_update: called after every frame that was carried out.
-        reject: called with source and reason where bytes are no frame.
+        reject: called with source and reason if bytes are not a frame.
 
     Raises:
-        ValueError: a description of frames that makes no sense, naming the parameter.
+        ValueError: an inconsistent description of frames; the message names the parameter.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class SerialTerminal:
             OSError: the link cannot be made.
         """
         leader, follower = os.openpty()
-        self._descriptors = (leader, follower)  # the follower stays open, so that the outputs outlive the client
+        self._descriptors = (leader, follower)  # the follower stays open, so that the outputs outlast the client
         tty.setraw(follower)
         os.set_blocking(leader, False)
         self._link, self._name = link, os.ttyname(follower)
@@ -72,7 +72,7 @@ class SerialTerminal:
         self._loop.watch(leader, self._on_readable)
 
     def close(self) -> None:
-        """Take terminal and link away, if they are there."""
+        """Remove terminal and link, if they exist."""
         if self._descriptors is None:
             return
         self._loop.forget(self._descriptors[0])

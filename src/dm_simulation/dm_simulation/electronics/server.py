@@ -1,7 +1,7 @@
 """The units on the wire: an EDAC40 on loopback TCP and UDP with discovery, a serial unit on a pseudo-terminal.
 
-One thread owns all sockets and, through `run()`, everything that frames change: frames are carried out in the order in
-which they arrived, and whoever asks for the state sees every frame that was sent before the question.
+One thread owns all sockets and, through `run()`, everything that frames change: frames are carried out in the order of
+their arrival, and a request for the state sees every frame that was sent before it.
 """
 
 import errno
@@ -29,7 +29,7 @@ DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 
 @dataclass(frozen=True)
 class PortsConfig:
-    """Where the units are to be found, and what is spoken at the serial port (by default a USB DAC-40)."""
+    """Ports and paths of the units, and the protocol of the serial port (by default that of a USB DAC-40)."""
 
     tcp_port: int = parameter(whole(1234, -1, 65535), f"EDAC40 over TCP {PORT_TEXT}")
     udp_port: int = parameter(whole(1234, -1, 65535), f"EDAC40 over UDP {PORT_TEXT}")
@@ -46,16 +46,16 @@ class ElectronicsServer:
 
     Args:
         on_update: called in the server's thread after every frame that was carried out.
-        on_event: called with (severe, text) when something worth a log line happens; severe is what is no frame, or
-            could not be carried out.
+        on_event: called with (severe, text) for the log; severe: bytes that are not a frame, or a frame that could not
+            be carried out.
 
     Attributes:
-        run: runs a task in the server's thread, after every frame that had arrived; see `EventLoop.run`.
+        run: runs a task in the server's thread, after every frame that has arrived; see `EventLoop.run`.
         endpoints: actual "tcp_port", "udp_port", "discovery_port" and "pty", as far as they are offered.
-        malformed_count: what was received and is no frame; the reasons are events.
+        malformed_count: number of inputs that were not a frame; the reasons are reported as events.
 
     Raises:
-        OSError: a port is taken, naming it.
+        OSError: a port is taken; the message names it.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ElectronicsServer:
             raise
 
     def set_plugged(self, plugged: bool) -> None:
-        """Pull the data cable out or put it back on the same ports. The outputs hold their values meanwhile."""
+        """Unplug the data cable, or plug it in again on the same ports. The outputs hold their values meanwhile."""
         if plugged != self.plugged:
             self.run(self._plug if plugged else self._unplug)
             self._on_event(False, "plugged in" if plugged else "unplugged: outputs hold")
@@ -134,15 +134,15 @@ class ElectronicsServer:
         self._unit.take_edac40(frames.decode_edac40(frame))
         self._on_update()
 
-    # EDAC40 over TCP: one client. While it is connected the port is bound but nobody listens, so that a second one is
-    # refused as the unit does.
+    # EDAC40 over TCP: one client. While it is connected the port is bound but not listening, so that a second client is
+    # refused, as the real unit does.
 
     def _listen(self, port: int) -> None:
         placeholder = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         placeholder.setblocking(False)
         self._listener = placeholder
-        # A connection that was waiting when the port was closed holds its number for a moment longer.
+        # A connection that was pending when the port was closed keeps the port in use for a moment longer.
         _bind(placeholder, port, "electronics.tcp_port", patience_s=0.0 if self._client is None else 1.0)
         self.endpoints["tcp_port"] = placeholder.getsockname()[1]
         if self._client is None:
@@ -203,7 +203,7 @@ class ElectronicsServer:
                 del self._stream[:length]
                 self._take_edac40(frame)
         except FrameError as error:
-            # A stream has no frame marks: after a bad header the rest of what has arrived means nothing.
+            # A stream has no frame marks: after a bad header the rest of the data received cannot be interpreted.
             self._reject("TCP", str(error), bytes(self._stream))
             self._stream.clear()
 
@@ -239,11 +239,11 @@ class ElectronicsServer:
 
 
 class PortError(OSError):
-    """A port of this machine cannot be had.
+    """A port of this machine is not available.
 
     Args:
-        name: of the parameter that asks for it.
-        port: as it asks.
+        name: of the parameter that sets it.
+        port: as set there.
         error: the reason.
     """
 

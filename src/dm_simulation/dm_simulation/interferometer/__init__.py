@@ -1,1 +1,1 @@
-"""The interferometer: pictures of the plate, its files and its trigger."""
+"""The interferometer: maps of the plate, map files and trigger."""

@@ -1,4 +1,4 @@
-"""The camera: what a Fizeau interferometer would report of the plate, with its noise, piston, tilt and dropouts.
+"""Maps of the plate as a Fizeau interferometer would measure them, with its noise, piston, tilt and dropouts.
 
 Everything smooth (influence functions to order 36, initial figure, low-order noise, piston, tilt) is a polynomial in
 x and y over the field, so a map is two thin matrix products, T(y) C T(x)^T with T the Chebyshev polynomials at the
@@ -19,7 +19,7 @@ from dm_simulation.mirror.plate import Plate
 from dm_simulation.mirror.zernike import Array
 
 WAVELENGTH = 632.8e-9
-#: Spread of the amplitude of vibration from map to map, of its logarithm.
+#: Standard deviation, from map to map, of the logarithm of the amplitude of vibration.
 VIBRATION_SPREAD = 0.8
 
 
@@ -95,13 +95,13 @@ class Interferometer:
     """The instrument in front of one mirror, whose influence on the sag is a polynomial.
 
     Args:
-        figure_rng: draws the initial figure, once.
-        noise_rng: draws what differs from map to map.
+        figure_rng: draws the initial figure once.
+        noise_rng: draws everything that differs from map to map.
 
     Attributes:
         pitch: m per pixel.
-        aperture: (pixels, pixels) bool, pixels whose centre is inside the field.
-        noise: as `noise_rng`; a copy of this object may draw from one of its own.
+        aperture: (pixels, pixels) bool, True for pixels whose centre is inside the field.
+        noise: the generator `noise_rng`; a copy of this object may be given its own.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class Interferometer:
         terms = zernike.terms_to_order(12)[3:]
 
         def drawn(size: float, *places: tuple[Array, Array], terms: tuple[zernike.Term, ...] = terms) -> list[Array]:
-            """One shape as it is at each of these places of the nodes; `size` is its rms at the first of them."""
+            """One random shape at each of these positions of the nodes; `size` is its rms at the first of them."""
             amplitudes = figure_rng.standard_normal(len(terms)) / np.array([term.n for term in terms]) ** 1.5
             shapes = [interpolate((zernike.evaluate(*at, terms) @ amplitudes)[..., None])[0] for at in places]
             inside = self._evaluate(shapes[0])[self.aperture]
@@ -172,7 +172,7 @@ class Interferometer:
         low_terms = zernike.terms_to_order(5)[3:]
         self._retrace = np.array([drawn(config.retrace, (x, y), terms=low_terms)[0] for _ in range(2)])
         self._lasting, self._measured = np.zeros(len(self._low_orders) - 3), -np.inf
-        # Sag at the edge by tilt, as a sum over coefficients of products: mean of f x over that of x^2.
+        # Linear forms in the coefficients that give the sag at the edge by tilt: mean of f x divided by that of x^2.
         inside = np.where(x**2 + y**2 <= 1, 1.0, 0.0)
         products = chebyshev.chebvander(nodes, degree)
         self._tilts = np.array(
@@ -181,14 +181,14 @@ class Interferometer:
 
     @staticmethod
     def _on_mirror(x: Array, y: Array, mount: InterferometerConfig) -> tuple[Array, Array]:
-        """Places of the field (m) in the frame of the mirror as it is mounted."""
+        """Positions in the field (m), converted to the frame of the mirror as it is mounted."""
         x, y = (x - mount.mount_x) / mount.mount_scale, (y - mount.mount_y) / mount.mount_scale
         cosine, sine = np.cos(mount.mount_angle), np.sin(mount.mount_angle)
         x, y = cosine * x + sine * y, cosine * y - sine * x
         return (-x if mount.mount_mirrored else x), y
 
     def surface(self, displacement: Array) -> Array:
-        """The surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
+        """The surface over the field, without the instrument's noise, for spring bases at `displacement` (N,), m.
 
         Returns:
             Sag in m as coefficients (p, q) of T_p(y) T_q(x), x and y in units of the field's radius.
@@ -196,21 +196,21 @@ class Interferometer:
         return np.tensordot(displacement, self._influence, 1) + self._figure
 
     def true_surface(self, displacement: Array) -> Array:
-        """The same in true lengths about the mirror's own centre, as whoever looks by another way sees it."""
+        """The same without shift and scale error of the mount: in true lengths about the mirror's own centre."""
         return np.tensordot(displacement, self._true_influence, 1) + self._true_figure
 
     def _evaluate(self, coefficients: Array) -> Array:
         return (self._rows @ coefficients) @ self._columns.T
 
     def _camera(self, picture: Array) -> Array:
-        """The picture as the camera turns it."""
+        """The map as the camera shows it: rotated, then flipped."""
         picture = np.rot90(picture, self.config.rotate_deg // 90)
         if self.config.flip_x:
             picture = picture[:, ::-1]
         return picture[::-1] if self.config.flip_y else picture
 
     def true_sag(self, displacement: Array) -> Array:
-        """The noise-free surface (pixels, pixels), m, as the camera shows it, NaN outside: for judging only."""
+        """The noise-free surface (pixels, pixels), m, as the camera shows it, NaN outside: for evaluation only."""
         return self._shown(self._evaluate(self.surface(displacement)))
 
     def reference(self) -> Array:
@@ -230,7 +230,7 @@ class Interferometer:
         """A map of the surface with spring bases at `displacement` (N,), m: (pixels, pixels), m, NaN = no data.
 
         Args:
-            time: s, of any clock, for noise that lasts.
+            time: s, of any clock; decides how much low-order noise is kept from the map before.
         """
         config, rng = self.config, self.noise
         low = np.empty(len(self._low_orders))

@@ -23,12 +23,12 @@ INVALID_COUNT = 2147483640
 SCALE_FACTOR = 0.5
 #: Counts per fringe of phase resolution codes 0, 1, 2.
 RESOLUTION = (4096, 32768, 131072)
-#: What Mx stores where there is no data.
+#: Value that Mx stores where there is no data.
 NO_DATA = 1.7976931348623157e308
 FORMATS = ("dat", "datx")
 MAP_NAME = re.compile(rf"(map_\d{{6,}}|measure_\d+_\d+)\.({'|'.join(FORMATS)})")
 UNITS = ("Fringes", "NanoMeters")
-#: In which a file grows on a slow network share.
+#: Number of pieces in which a file grows on a slow network share.
 PIECES = 8
 
 
@@ -163,9 +163,9 @@ def deliver(content: bytes, path: Path, seconds: float = 0.0) -> None:
 
 
 def prune(folder: Path, limit: float) -> None:
-    """Remove the oldest maps until those in `folder` take no more than `limit` bytes; the newest stays in any case.
+    """Remove the oldest maps until those in `folder` take no more than `limit` bytes; the newest is always kept.
 
-    Only names that the bench and the node `interferometer` give to maps count: whatever else is there is not ours.
+    Only files with a name that the bench or the node `interferometer` gives to maps are counted and removed.
     """
     maps = []
     for path in (path for path in folder.iterdir() if MAP_NAME.fullmatch(path.name)):

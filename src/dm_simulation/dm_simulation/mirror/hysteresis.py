@@ -1,9 +1,9 @@
 """Hysteresis laws of piezo ceramics: rate-independent, one state per actuator, vectorised over actuators.
 
-Each law is a reversible straight line plus a part m that depends on the past: y = scale (u + weight m[u]). Weight and
-scale of each actuator follow from simulated full cycles, such that y spans 2 over signals -1..+1 (total stroke 1 in
-units of half the stroke each way) and the loop opens by `fraction` of the total stroke where it is widest, which is how
-vendors state hysteresis.
+Each law is a straight line, which is reversible, plus a part m that depends on the past: y = scale (u + weight m[u]).
+Weight and scale of each actuator follow from simulated full cycles, such that y spans 2 over signals -1..+1 (in units
+of half the stroke) and the largest opening of the loop is `fraction` of the total stroke, which is how vendors state
+hysteresis.
 """
 
 import copy
@@ -15,37 +15,37 @@ import numpy as np
 from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 from dm_simulation.mirror.zernike import Array
 
-#: Bouc-Wen and Jiles-Atherton laws are integrated in steps of at most so much of a signal.
+#: Largest integration steps of the Bouc-Wen and of the Jiles-Atherton law, in normalised signal.
 BOUC_WEN_STEP, JILES_ATHERTON_STEP = 0.02, 0.005
-#: Points of a sweep and cycles from which the opening of a loop is taken.
+#: Points of a sweep and number of cycles with which the opening of a loop is found.
 SWEEP_POINTS, SWEEP_CYCLES = 61, 2
-#: Of drawn Bouc-Wen laws: order, `onward` of rising and of falling moves, `back`.
+#: Ranges of drawn Bouc-Wen laws: order, `onward` of rising and of falling moves, `back`.
 BOUC_WEN_RANGES = (0.8, 3.0), (1.5, 3.0), (1.5, 3.0), (0.3, 1.2)
-#: Drawn loops are no wider than this share of what their law can have.
+#: Largest width of drawn loops, as a share of the largest that their law can have.
 WIDEST = 0.8
 
 
 class HysteresisLaw(Protocol):
-    """The part of the response that depends on the past."""
+    """The part m of the response that depends on the past."""
 
     def move(self, u: Array) -> Array:
         """Go monotonically from the last signals to `u` (N,) and return m (N,)."""
 
 
 def prandtl_ishlinskii_density(v: Array, r: Array) -> Array:
-    """Relays whose number falls exponentially with the half-width, wherever their centre: loops are symmetric."""
+    """Density of relays that falls exponentially with the half-width r, at any centre v: loops are symmetric."""
     return np.exp(-r / 0.25) + 0.0 * v
 
 
 def skew_density(v: Array, r: Array) -> Array:
-    """Relays of which there are more on one side, positive over the whole range of the electronics."""
+    """Density of relays that is larger at positive centres v; positive over the whole range of the electronics."""
     return np.exp(-r / 0.3) * (1 + 0.45 * v - 0.12 * v * v)
 
 
 class BoucWenHysteresis:
-    """Bouc-Wen of any order n, the lag -z: along the way dz/d|u| = 1 - onward |z|^n, with onward = -back against it.
+    """Bouc-Wen law of any order n, m = -z: dz/d|u| = 1 - onward |z|^n, with -back for onward where z opposes the move.
 
-    The generalised law of [20] with three constants: z saturates earlier on falling than on rising moves where the two
+    The generalised law of [20] with three constants: z saturates earlier on falling than on rising moves if the two
     values of `onward` differ. [19] with n = 1 is onward = beta + gamma, back = beta - gamma. The law has no
     return-point memory: a minor loop does not close exactly.
 
@@ -82,14 +82,14 @@ class BoucWenHysteresis:
 
 
 class JilesAthertonHysteresis:
-    """The domain wall law of [36], which [37] carries over to piezo ceramics; tanh is the curve without walls.
+    """The domain wall law of [36], which [37] applies to piezo ceramics; tanh is the anhysteretic curve.
 
-    Walls are pinned: m follows that curve only on the way towards it, the slower the stronger they are pinned, and
-    bends reversibly by a share of its slope. Minor loops neither close nor wipe anything out. Simplified: m adds to the
-    signal, but not to its change. The step is that of the actuator that moves farthest, which makes 3 nm at most.
+    Walls are pinned: m approaches that curve only on moves towards it, the more slowly the stronger the pinning, and
+    follows a share of its slope reversibly. Minor loops neither close nor erase earlier turning points. Simplified: m
+    adds to the signal, but not to its change. All share the step of the farthest move, which makes 3 nm at most.
 
     Args:
-        width, pinning, reversible, coupling: of that curve, of a full loop, share, and how m adds to the signal; (N,).
+        width, pinning, reversible, coupling: (N,) width of tanh, pinning, reversible share, weight of m in the signal.
     """
 
     def __init__(self, count: int, width: Array, pinning: Array, reversible: Array, coupling: Array) -> None:
@@ -110,7 +110,7 @@ class JilesAthertonHysteresis:
 
 
 class MixedHysteresis:
-    """A weighted sum of laws; of none, a linear actuator's 0."""
+    """A weighted sum of laws; without any law 0, as for a linear actuator."""
 
     def __init__(self, parts: tuple[tuple[Array | float, HysteresisLaw], ...]) -> None:
         self._parts = parts
@@ -120,7 +120,7 @@ class MixedHysteresis:
 
 
 def _drawn_constants(count: int, rng: np.random.Generator, *ranges: tuple[float, float]) -> Array:
-    """Constants (C, N): the mirror's, one within each range, from which those of an actuator differ by a tenth."""
+    """Constants (C, N): one of the mirror within each range, about which those of its actuators scatter by a tenth."""
     middle = [rng.uniform(low, high) for low, high in ranges]
     return np.exp(0.1 * rng.standard_normal((len(ranges), count))) * np.array(middle)[:, None]
 
@@ -140,13 +140,13 @@ def _drawn_jiles_atherton(count: int, rng: np.random.Generator) -> HysteresisLaw
 
 
 def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    """Preisach's and Bouc-Wen's law in parts that differ between the actuators."""
+    """A mixture of Preisach's and the Bouc-Wen law, with shares that differ between the actuators."""
     share = np.clip(rng.uniform(0.2, 0.8) + 0.1 * rng.standard_normal(count), 0.0, 1.0)
     return _in_parts(share, _drawn_preisach(count, rng), _drawn_bouc_wen(count, rng))
 
 
 def _drawn_unlike(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    """Actuators with no more in common than those of other mirrors: Preisach, on every other one with Bouc-Wen."""
+    """Actuators that differ as much as those of different mirrors: Preisach, for half of them mixed with Bouc-Wen."""
     densities = [drawn_density(1, rng) for _ in range(count)]
     preisach = PreisachOperator(count, lambda v, r: np.concatenate([density(v, r) for density in densities]))
     bouc_wen = BoucWenHysteresis(count, *(rng.uniform(*bounds, count) for bounds in BOUC_WEN_RANGES))
@@ -154,7 +154,7 @@ def _drawn_unlike(count: int, rng: np.random.Generator) -> HysteresisLaw:
 
 
 def _in_parts(share: Array, first: HysteresisLaw, second: HysteresisLaw) -> HysteresisLaw:
-    """`share` (N,) of the first law and the rest of the second, each alone with a loop of the same opening."""
+    """`share` (N,) of the first law plus the rest of the second, each normalised to the same loop opening."""
     parts = []
     for law, part in ((first, share), (second, 1 - share)):
         rising, falling = _full_loop(law, len(share))
@@ -167,8 +167,8 @@ def _mixed(count: int, _rng: np.random.Generator) -> HysteresisLaw:
     return MixedHysteresis(((4.0, PreisachOperator(count, skew_density)), (0.5, bouc_wen)))
 
 
-#: Laws by name. Those that begin with `drawn` are drawn at random, for each actuator its own; the others are all
-#: actuators'.
+#: Laws by name. Those that begin with `drawn` are drawn at random, one for each actuator; the others are common to all
+#: actuators.
 LAWS: dict[str, Callable[[int, np.random.Generator], HysteresisLaw]] = {
     "none": lambda count, rng: MixedHysteresis(()),
     "prandtl_ishlinskii": lambda count, rng: PreisachOperator(count, prandtl_ishlinskii_density),
@@ -189,7 +189,7 @@ class Hysteresis:
     Args:
         law: one of LAWS.
         fraction: largest opening of the full loop over -1..+1, as a fraction of the total stroke; a number, or (N,).
-        rng: draws the law, where it is one that is drawn.
+        rng: draws the law if it is one of those drawn at random.
 
     Raises:
         ValueError: unknown law, or an opening that the law cannot reach.
@@ -209,7 +209,7 @@ class Hysteresis:
 
 
 def _full_loop(law: HysteresisLaw, count: int) -> tuple[Array, Array]:
-    """m on the rising and on the falling branch (SWEEP_POINTS, N) of a steady full cycle, over rising signals."""
+    """m on the rising and the falling branch (SWEEP_POINTS, N) of a steady full cycle, both in order of the signal."""
     trial = copy.deepcopy(law)
     grid = np.linspace(-1, 1, SWEEP_POINTS)
 
@@ -222,7 +222,7 @@ def _full_loop(law: HysteresisLaw, count: int) -> tuple[Array, Array]:
 
 
 def _weight_and_scale(name: str, law: HysteresisLaw, fraction: Array) -> tuple[Array, Array]:
-    """Weight (N,) of the law and scale (N,) of the whole for the wanted openings (N,)."""
+    """Weight (N,) of the law and scale (N,) of the sum for the required openings (N,)."""
     rising, falling = _full_loop(law, len(fraction))
     opening, span = np.max(falling - rising, axis=0), rising[-1] - rising[0]
     asked = f"piezo.hysteresis = {fraction.max():g}"

@@ -1,13 +1,13 @@
-"""A membrane that electrodes behind it attract: a mirror by another principle than piezo stacks.
+"""A membrane attracted by electrodes behind it: a mirror by another principle than piezo stacks.
 
 The membrane is under tension T and clamped at its edge, so its deflection follows the Poisson equation
-``T div grad w = -p`` with w = 0 there ([30]). Electrodes press on it with ``p = epsilon V^2 / (2 g^2)``, g the gap that
-the membrane leaves where it stands: they only pull, the more the nearer it has come, until it rests on stops at a third
-of the gap. There is neither hysteresis nor creep; the zero drifts slowly after the start, as in a mount that warms up.
+``T div grad w = -p`` with w = 0 there ([30]). Electrodes act on it with ``p = epsilon V^2 / (2 g^2)``, g the present
+gap: they only pull, the more strongly the closer the membrane has come, until it rests on stops at a third of the gap.
+There is neither hysteresis nor creep; the zero drifts slowly after the start, as in a mount that warms up.
 
 With rho = r / a, the polynomials ``(1 - rho^2) rho^m P_k^(1,m)(2 rho^2 - 1)`` times cos or sin of m theta vanish at the
 edge, and the Laplacian multiplies what follows the first bracket by ``-4 (k + 1)(k + m + 1)``, so in this basis the
-solution is written down: P are Jacobi polynomials, orthogonal over the disc with the weight 1 - rho^2.
+solution is explicit: P are Jacobi polynomials, orthogonal over the disc with the weight 1 - rho^2.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ from dm_simulation.mirror.zernike import Array
 
 #: Permittivity of free space, A s / (V m).
 EPSILON = 8.8541878128e-12
-#: Points of the quadrature over an electrode, along its radius and around it: good to 1e-9 of its load.
+#: Quadrature points over an electrode, along its radius and around it: accurate to 1e-9 of its load.
 _RADII, _ANGLES = 6, 16
-#: Rounds in which gap and pressure settle, and the change of a gap, in its own unit, at which they have.
+#: Most iterations of gap and pressure, and the change of the deflection, as a share of the gap, that ends them.
 _ROUNDS, _SETTLED = 100, 1e-9
 
 
@@ -51,15 +51,15 @@ class Membrane:
 
     Args:
         config: geometry.
-        rng: draws pull of the electrodes and pattern of the drift.
-        time: s, from which on the zero drifts.
+        rng: draws the pull of the electrodes and the pattern of the drift.
+        time: s, at which the drift of the zero begins.
 
     Attributes:
         x, y: positions of the electrodes (N,), m.
         radius: m.
 
     Raises:
-        ValueError: no such pattern, or one that the membrane does not cover.
+        ValueError: the electrodes do not form full rings, or extend beyond the membrane.
     """
 
     def __init__(self, config: MembraneConfig, rng: np.random.Generator, time: float = 0.0) -> None:
@@ -100,13 +100,13 @@ class Membrane:
         mean = np.repeat(weights / 2, _ANGLES) / _ANGLES
         loads = np.tensordot(mean, self._modes(self.x + x[:, None], self.y + y[:, None]), 1).T
         loads *= np.pi * (self.config.electrode_diameter / 2 / self.radius) ** 2
-        # Load over norm of the polynomial over the factor of the Laplacian.
+        # Load divided by the norm of the polynomial and by the factor of the Laplacian.
         around = np.where(self._m == 0, 2, 1) * np.pi
         factor = self.radius**2 / (2 * self.config.tension) * (self._n + 2) / (around * (self._k + 1) ** 2)
         return np.asarray(factor[:, None] * loads)
 
     def influence_at(self, x: Array, y: Array) -> Array:
-        """Sag at points (in m) per Pa on each electrode: x.shape + (N,). What they pull, from behind, is hollow."""
+        """Sag at points (in m) per Pa on each electrode: x.shape + (N,). The pull from behind makes it concave."""
         return -self._modes(x, y) @ self._compliance
 
     def advance(self, time: float) -> None:
@@ -119,7 +119,7 @@ class Membrane:
         self.advance(time)
         gap = self.config.gap
         pull = self._gain * EPSILON / 2 * (volts / gap) ** 2
-        nearer = np.zeros(len(pull))  # deflections as shares of the gap: they grow from round to round
+        nearer = np.zeros(len(pull))  # deflections as shares of the gap: they grow with each iteration
         for _ in range(_ROUNDS):
             self._pressure = pull / (1 - nearer) ** 2
             before, nearer = nearer, np.minimum(self._at_electrodes @ self._pressure / gap, 1 / 3)
@@ -128,5 +128,5 @@ class Membrane:
 
     @property
     def displacement(self) -> Array:
-        """Pressures on the electrodes (N,), Pa, at the time last given; drift of the zero counts as pressure."""
+        """Pressures on the electrodes (N,), Pa, at the time last given; includes the drift of the zero as pressure."""
         return self._pressure - self._drift * np.expm1((self._began - self._time) / self.config.drift_time)

@@ -1,6 +1,6 @@
 """The piezo stacks: gains, hysteresis and creep, from signals to base displacements of the plate's springs.
 
-What stacks differ in, and what they do beyond a rate-independent law and creep, is off by default.
+Differences between stacks, and effects beyond a rate-independent law and creep, are off by default.
 """
 
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from dm_common.values import parameter, real, text, whole
 from dm_simulation.mirror.hysteresis import LAWS, Hysteresis
 from dm_simulation.mirror.zernike import Array
 
-#: Time constants of the part of a loop that lags behind fast moves, s, and how many of them a decade holds.
+#: Time constants of the part of a loop that lags behind fast moves, s, and their number per decade.
 LAG_TIMES_S, LAG_PER_DECADE = np.geomspace(1e-3, 10.0, 13), 3
-#: degC, and the length of a day, s.
+#: Room temperature, degC, and length of a day, s.
 ROOM, DAY_S = 20.0, 86400.0
-#: Periods of the drift of a day, s.
+#: Periods of the components of the daily drift, s.
 DRIFT_PERIODS_S = np.array([86400.0, 7 * 3600.0, 3600.0])
 
 
@@ -59,7 +59,7 @@ class PiezoConfig:
     warm_base: float = parameter(real(0.0, 0.0, 1e-7, "m/K"), "What bases go by per kelvin, standard deviation.")
 
 
-#: Stacks of which each has a law, a loop and a creep of its own.
+#: Stacks that differ from each other in law, loop and creep.
 DRAWN = PiezoConfig(
     law="drawn_preisach",
     hysteresis_spread=0.15,
@@ -79,7 +79,7 @@ class PiezoActuators:
     Attributes:
         gain: (N,) relative gains.
         stuck: (N,) bool, actuators that no longer follow.
-        signals: (N,) that they follow.
+        signals: (N,) signals that they follow, with crosstalk.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class PiezoActuators:
 
     @property
     def _age(self) -> float:
-        """s since the start: figures follow from the seed, whatever the time of day."""
+        """s since the start, so that results follow from the seed whatever the time of day."""
         return self._time - self._began
 
     @property
@@ -138,7 +138,7 @@ class PiezoActuators:
         self._began += min(elapsed, 0.0)
         self._time = time
         if elapsed > 0:
-            # Exact for a constant position, hence independent of how the time is cut into steps.
+            # Exact for a constant position, hence independent of how the time is divided into steps.
             self._crept += (self._position[:, None] - self._crept) * -np.expm1(-elapsed / self._creep_times)
             if self.config.rate_dependence:
                 loop = (self._position - self.signals)[:, None]

@@ -1,7 +1,7 @@
 """The faceplate: a free-edge elastic circular plate on springs whose bases the piezo stacks move.
 
 Kirchhoff plate theory ([7], sections 10 and 21), solved by the Rayleigh-Ritz method: free edges are natural boundary
-conditions, so Zernike polynomials are admissible as they stand.
+conditions, so Zernike polynomials are admissible without modification.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ def actuator_positions(
     """Positions x, y (N,) in m of the actuators 1..N.
 
     Raises:
-        ValueError: no number of full rings has that many, as the parameter `name` asks for.
+        ValueError: full rings cannot hold that number of actuators; the message names the parameter `name`.
     """
     corners = np.exp(1j * np.pi / 3 * np.arange(7))
     grid = [np.zeros(1, complex)]
@@ -75,7 +75,7 @@ def neighbour_pairs(x: Array, y: Array) -> NDArray[np.intp]:
     """Pairs (P, 2) of 0-based actuators closer than 1.2 times the smallest distance.
 
     Raises:
-        ValueError: two at the same place.
+        ValueError: two actuators are at the same place.
     """
     distance = np.hypot(x[:, None] - x, y[:, None] - y)
     first, second = np.triu_indices(len(x), k=1)

@@ -1,9 +1,9 @@
 """Preisach operators on the plane of switching signals, by their Everett function; densities drawn at random.
 
-A relay switches up where the signal rises to alpha = v + r and down where it falls to beta = v - r. How many relays a
-move from one turning point to a signal switches is the Everett function F(alpha, beta), the density integrated over the
-triangle between both ([16], section 2.4). The turning points that no later move has wiped out are all that an operator
-remembers.
+A relay switches up where the signal rises to alpha = v + r and down where it falls to beta = v - r. The Everett
+function F(alpha, beta) gives how many relays switch on a move from a turning point to a signal: the density integrated
+over the triangle between both ([16], section 2.4). An operator remembers only the turning points that no later move has
+wiped out.
 """
 
 from collections.abc import Callable
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from dm_simulation.mirror.zernike import Array
 
-#: Density of relays at centres v and half-widths r, per unit of each: (G, G) from (G, G), or (N, G, G), each
-#: actuator's own.
+#: Density of relays at centres v and half-widths r, per unit of each: (G, G) from (G, G) if common to all actuators,
+#: (N, G, G) if each has its own.
 Relays = Callable[[Array, Array], Array]
-#: The tables of Everett functions go from -EDGE to +EDGE, in so many points.
+#: Range -EDGE to +EDGE of the tables of Everett functions, and their number of points.
 EDGE, POINTS = 1.2, 121
 
 
 class PreisachOperator:
     """`count` Preisach operators that begin demagnetised at signal 0.
 
-    The Everett function is a table of F / (alpha - beta)^2, which is smooth, so that between its points F vanishes on
-    the diagonal as it must and small moves have parabolic loops.
+    The Everett function is stored as a table of F / (alpha - beta)^2, which is smooth. Interpolated from it, F vanishes
+    on the diagonal, as it must, and small moves have parabolic loops.
     """
 
     def __init__(self, count: int, relays: Relays) -> None:
@@ -36,18 +36,18 @@ class PreisachOperator:
         gap = alpha - beta + np.eye(POINTS)
         diagonal = np.diagonal(density, axis1=1, axis2=2)[:, :, None] * np.eye(POINTS) / 4
         self._table = np.where(gap > 0, everett / gap**2, 0.0) * (1 - np.eye(POINTS)) + diagonal
-        # Below the diagonal the table is mirrored, so that interpolation across it is one of a smooth function.
+        # Below the diagonal the table is mirrored, so that interpolation across it sees a smooth function.
         self._table += np.swapaxes(np.tril(self._table, -1), 1, 2)
         self._middle = first
-        # Turning points not wiped out yet and m there, from the outermost on. Below the first real one stands its
-        # mirror image, from which the first loop of a demagnetised operator would have come.
+        # Turning points not wiped out yet, the outermost first, and m at each. Before the first real one comes its
+        # mirror image, at which the first loop of a demagnetised operator would have begun.
         self._turn = np.zeros((count, 8))
         self._height = np.zeros((count, 8))
         self._depth = np.zeros(count, int)
         self._u, self._m, self._way = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def move(self, u: Array) -> Array:
-        """Go monotonically from the last signals to `u` (N,), which count as EDGE beyond it; returns m (N,)."""
+        """Go monotonically from the last signals to `u` (N,), clipped to +-EDGE; returns m (N,)."""
         u = np.clip(u, -EDGE, EDGE)
         way = np.sign(u - self._u)
         turned = way * self._way < 0
@@ -56,12 +56,12 @@ class PreisachOperator:
             self._push(first, -self._u, self._initial(-self._u))
         if turned.any():
             self._push(turned, self._u, self._m)
-        # Turning points of the way's own kind that are passed are wiped out, and those that they had come from.
+        # A move wipes out the turning points of its own direction that it passes, each with the one before it.
         place = np.arange(self._turn.shape[1])
         left = self._depth[:, None] - place
         passed = (left >= 2) & (left % 2 == 0) & ((self._turn - u[:, None]) * way[:, None] <= 0) & (way != 0)[:, None]
         self._depth -= 2 * np.count_nonzero(passed, axis=1)
-        self._depth[self._depth == 1] = 0  # only the mirror image is left: again as at the beginning
+        self._depth[self._depth == 1] = 0  # only the mirror image is left: demagnetised state again
         branch = np.maximum(self._depth - 1, 0)[:, None]
         start = np.take_along_axis(self._turn, branch, axis=1)[:, 0]
         m = np.take_along_axis(self._height, branch, axis=1)[:, 0] + way * self._switched(u, start)
@@ -81,7 +81,7 @@ class PreisachOperator:
         self._depth[rows] += 1
 
     def _switched(self, one: Array, other: Array) -> Array:
-        """The Everett function of moves between two signals (N,)."""
+        """The Everett function for moves between two signals (N,)."""
         high, low = np.maximum(one, other), np.minimum(one, other)
         (i, x), (j, y) = _place(high), _place(low)
         row, table = self._row, self._table
@@ -90,14 +90,14 @@ class PreisachOperator:
         return (high - low) ** 2 * ((1 - x) * below + x * above)
 
     def _initial(self, u: Array) -> Array:
-        """m on the way out from the demagnetised state, where relays with alpha + beta < 0 are up."""
+        """m on the initial curve from the demagnetised state, where relays with alpha + beta < 0 are up."""
         i, x = _place(np.abs(u))
         middle = (1 - x) * self._middle[self._row, i] + x * self._middle[self._row, i + 1]
         return middle + np.sign(u) / 2 * self._switched(np.abs(u), -np.abs(u))
 
 
 def _place(u: Array) -> tuple[Array, Array]:
-    """Points of the table below signals, and how far beyond them, as a share of the spacing."""
+    """Index of the table point below each signal, and the distance from it as a share of the spacing."""
     at = (u + EDGE) * ((POINTS - 1) / (2 * EDGE))
     i = np.minimum(at.astype(int), POINTS - 2)
     return i, at - i
@@ -107,7 +107,7 @@ def _everett(density: Array, step: float) -> tuple[Array, Array]:
     """Integrals of densities (M, G, G) over triangles.
 
     Returns:
-        (M, G, G) from beta to alpha, and (M, G) mean of m at +u and at -u on the way out from the demagnetised state.
+        (M, G, G) from beta to alpha, and (M, G) mean of m at +u and at -u on the initial curve, demagnetised at 0.
     """
 
     def cumulated(values: Array, axis: int) -> Array:
@@ -134,7 +134,7 @@ def _everett(density: Array, step: float) -> tuple[Array, Array]:
 
 
 def drawn_density(count: int, rng: np.random.Generator, spread: float = 0.15) -> Relays:
-    """A density of no simple kind for a mirror, and for each of `count` actuators its own, that far from it.
+    """A random density of no simple form for a mirror, and for each of `count` actuators one that differs by `spread`.
 
     The mirror's is one of three distributions over half-widths and centres, or over both switching signals, with bumps;
     each actuator's is that times the exponential of a smooth random field, a sum of bumps of heights `spread`.
