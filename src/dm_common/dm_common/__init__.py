@@ -1,4 +1,4 @@
-"""What more than one node of the suite needs: executor and parameters, optics, hysteresis model, limits, messages."""
+"""Code shared by several nodes of the suite: executor and parameters, optics, hysteresis model, limits, messages."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whatever happens while they are written."""
+"""Files that are written whole or not at all, whatever happens meanwhile."""
 
 import os
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ class StoreError(CodedError):
 
 @contextmanager
 def storing(failure: str) -> Iterator[None]:
-    """What the disk refuses in the body is a StoreError that begins with `failure`."""
+    """Turn an OSError raised in the body into a StoreError whose message begins with `failure`."""
     try:
         yield
     except OSError as error:
@@ -27,12 +27,12 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to a temporary file beside `path` and put it in its place in one step; the folder is made.
 
     Raises:
-        OSError: disk full, read-only, ...; what stood at `path` still does.
+        OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.unlink(missing_ok=True)  # of a process with the same id that was killed
+        temporary.unlink(missing_ok=True)  # left by a killed process that had the same id
         with temporary.open("xb") as file:
             file.write(content)
             file.flush()
@@ -42,7 +42,7 @@ def write_whole(path: Path, content: bytes) -> None:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
-    # The file stands, whatever comes of this: file systems in a network refuse it, and lose no name by that.
+    # The file is complete already: network file systems may refuse to sync a folder, which loses no name.
     with suppress(OSError):
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:

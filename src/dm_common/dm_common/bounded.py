@@ -4,11 +4,11 @@
     subject to low <= s_i <= high,   |s_i - s_j| <= d for neighbours i, j
 
 M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. The unconstrained solution
-is taken when it lies inside all limits. Else block principal pivoting [10] guesses which signals stand at an end of
+is taken if it lies inside all limits. Otherwise block principal pivoting [10] guesses which signals are at an end of
 their range, solves for the others, and changes all that are on the wrong side at once; a few rounds usually end at the
-optimum, where nothing is on the wrong side. Where they do not, and where differences between neighbours can bind, the
-problem becomes one of least distance, solved by non-negative least squares ([9], chapter 23) and checked against the
-optimality conditions: one signal enters per round, which takes longer the more of them saturate. Bounded-variable least
+optimum, where nothing is on the wrong side. Where pivoting does not settle, and where differences between neighbours
+can bind, the problem is solved as one of least distance by non-negative least squares ([9], chapter 23) and checked
+against the optimality conditions: one signal enters per round, so time grows with saturation. Bounded-variable least
 squares (BVLS [11]) steps in where that check fails, which takes condition numbers from 1e4 on; alone it takes many
 times longer, and at SciPy's default number of iterations it stops far from the optimum (measured on a PDM30-37: 13 nm
 rms instead of 6).
@@ -27,14 +27,14 @@ from dm_common.limits import SLACK, Limits
 
 #: A signal this close to an end of its range is taken to be bound there.
 NEAR_LIMIT = 1e-5
-#: Largest gradient against a signal that counts as none, as a share of the problem's own gradient at rest.
+#: Optimality: a gradient up to this counts as zero, as a share of the largest gradient at zero signals.
 OPTIMALITY = 1e-9
-#: Rounds of pivoting, and how many of them may leave no fewer signals on the wrong side than the best one before, until
-#: the other way is taken. Pivoting that goes astray would cycle.
+#: Maximum rounds of block pivoting, and rounds without progress (at least as many signals on the wrong side as in the
+#: best round so far) after which the least-distance method takes over. Pivoting may cycle otherwise.
 PIVOT_ROUNDS = 12
 PIVOT_SETBACKS = 3
-#: The same for signals known to stand at an end exactly. Stricter: with condition numbers of 1e5 a gradient of 1e-9
-#: still leaves the wrong signals at an end (measured: 1 % of the range).
+#: Gradient tolerance, as OPTIMALITY, for signals that are exactly at an end. Stricter: with condition numbers of 1e5 a
+#: gradient of 1e-9 still leaves the wrong signals at an end (measured: 1 % of the range).
 ROUNDING = 1e-13
 
 
@@ -55,7 +55,7 @@ class BoundedProgramme:
         if rows.ndim != 2 or not np.isfinite(rows).all():
             raise ValueError(f"matrix of shape {rows.shape}: must be two-dimensional and finite")
         count = rows.shape[1]
-        # In the matrix's own scale, so that metres and nanometres give the same numerics.
+        # Normalised by the largest entry, so that metres and nanometres give the same numerics.
         self._scale = float(np.abs(rows).max()) or 1.0
         stacked = np.vstack([rows / self._scale, np.sqrt(ridge) / self._scale * np.eye(count)])
         orthogonal, self._triangle = np.linalg.qr(stacked)
@@ -67,7 +67,7 @@ class BoundedProgramme:
         self._constraints, self._constraint_limits = self._linear_constraints(count)
 
     def _linear_constraints(self, count: int) -> tuple[Floats, Floats]:
-        """(C, c) of C y >= c0 - C d in terms of y = R s - d, see `_least_distance`."""
+        """The pair (C, c0) of the constraints C y >= c0 - C d, where y = R s - d, see `_least_distance`."""
         limits, identity = self.limits, np.eye(count)
         pairs = limits.pairs if limits.neighbours_can_bind else limits.pairs[:0]
         differences = identity[pairs[:, 0]] - identity[pairs[:, 1]]
@@ -105,7 +105,7 @@ class BoundedProgramme:
                 return pivoted
         signals = self._least_distance(projected)
         if self.limits.neighbours_can_bind:
-            # Found to the accuracy of an ill-conditioned problem: up to 1e-8 too much, which the driver would refuse.
+            # An ill-conditioned problem leaves signals up to 1e-8 beyond a limit, which the driver would refuse.
             return self.limits.scaled(signals)[0]
         signals = np.clip(signals, self.limits.low, self.limits.high)
         signals = self._polished(signals, projected)
@@ -123,7 +123,7 @@ class BoundedProgramme:
         for _round in range(PIVOT_ROUNDS):
             signals = self._with_bound(at_low, at_high, projected)
             gradient = triangle.T @ (triangle @ signals - projected)
-            # A bound signal stays where the gradient pushes it outwards; a free one where it is inside the range.
+            # A bound signal stays bound while the gradient pushes it outwards; a free one stays free inside the range.
             below = np.where(at_low, gradient > -tolerance, signals < low - SLACK)
             above = np.where(at_high, gradient < tolerance, signals > high + SLACK)
             wrong = int(np.count_nonzero(below != at_low) + np.count_nonzero(above != at_high))
@@ -137,7 +137,7 @@ class BoundedProgramme:
         return None
 
     def _with_bound(self, at_low: NDArray[np.bool_], at_high: NDArray[np.bool_], projected: Floats) -> Floats:
-        """Signals (N,) with some at an end of the range and the least-squares solution for the others."""
+        """Signals (N,) with the marked ones at an end of the range and the least-squares solution for the others."""
         signals = np.where(at_low, self.limits.low, np.where(at_high, self.limits.high, 0.0))
         free = ~(at_low | at_high)
         count = int(np.count_nonzero(free))
@@ -156,10 +156,10 @@ class BoundedProgramme:
         return bool(worst <= OPTIMALITY * np.abs(self._triangle.T @ projected).max())
 
     def _polished(self, signals: Floats, projected: Floats) -> Floats:
-        """Put the signals that stand at an end of the range exactly there and solve for the others once more.
+        """Put the signals that are at an end of the range exactly there and solve for the others once more.
 
-        The multipliers above are found to the accuracy of an ill-conditioned problem; with the set of bound signals
-        known, what remains is plain least squares.
+        `_least_distance` finds the multipliers only to the accuracy of an ill-conditioned problem. Once the set of
+        bound signals is known, the rest is ordinary least squares.
         """
         middle = self.limits.middle
         ends = np.where(signals < middle, self.limits.low, self.limits.high)

@@ -54,10 +54,10 @@ class ErrorCode(IntEnum):
 class CodedError(RuntimeError):
     """A failure that is answered with a code and a sentence that a person can act on.
 
-    Of a value, where callers expect a ValueError, it is both.
+    Errors about a value, where callers expect a ValueError, derive from both classes.
 
     Attributes:
-        error_code: a value of ErrorCode; of the class, where all its failures have the same.
+        error_code: a value of ErrorCode; a class attribute where all failures of the class share one.
     """
 
     error_code: int
@@ -78,7 +78,7 @@ class Refusal(CodedError):
 
 
 class MeasurementError(Refusal):
-    """One map could not be had; another try may succeed."""
+    """A single map could not be measured; another try may succeed."""
 
 
 class Cancelled(CodedError):
@@ -88,7 +88,7 @@ class Cancelled(CodedError):
 
 
 class UnknownNameError(CodedError, ValueError):
-    """No such name; the message lists the near ones, or says where it was looked for."""
+    """An unknown name; the message lists similar names, or says where it was looked for."""
 
     error_code = ErrorCode.UNKNOWN_NAME
 
@@ -108,9 +108,9 @@ class ClockError(CodedError, TimeoutError):
     error_code = ErrorCode.TIMEOUT
 
 
-#: That nothing can be predicted or kept true yet, and what to do.
+#: Message when nothing can be predicted or corrected because no calibration is in use, with what to do.
 NO_CALIBRATION = "no calibration is in use: run `./dm calibrate` or load_calibration"
-#: Begins the part of what `capabilities` say that tells why the history of the actuators is not known.
+#: Prefix of the part of the message of `capabilities` that says why the history of the actuators is not known.
 HISTORY_UNKNOWN = "wider error bound: "
 
 #: Failures that are answered with a code and a message; anything else is a defect.
@@ -118,5 +118,5 @@ EXPECTED = (CodedError, ValueError)
 
 
 def error_code(error: Exception) -> int:
-    """The code that answers one of the EXPECTED failures: its own, INVALID_ARGUMENT for a ValueError without."""
+    """The code that answers one of the EXPECTED failures: its own, or INVALID_ARGUMENT for a plain ValueError."""
     return error.error_code if isinstance(error, CodedError) else ErrorCode.INVALID_ARGUMENT

@@ -1,11 +1,11 @@
-"""Figures in sentences."""
+"""Numbers as text: lengths in nanometres or as fractions of a wavelength."""
 
 import math
 from typing import Any
 
 
 def rounded(value: float) -> str:
-    """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""
+    """Two significant digits, or all digits before the decimal point if there are more: 1.3, 97, 153."""
     return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.2g}"
 
 
@@ -15,7 +15,7 @@ def in_nanometres(length: float) -> str:
 
 
 def told_from(length: float, other: float) -> str:
-    """A length (m) with as many digits as tell it from one that it is compared with, two at least, such as 2.04 nm."""
+    """A length (m) with enough digits to distinguish it from `other`, at least two, such as 2.04 nm."""
     text, beside = in_nanometres(length), in_nanometres(other)
     for digits in (3, 4, 5):
         if text != beside or length >= 1e-6:
@@ -25,24 +25,24 @@ def told_from(length: float, other: float) -> str:
 
 
 def in_wavelengths(length: float, wavelength: float) -> str:
-    """A length (m) as a fraction of the wavelength, such as λ/50; "" above λ/5, which a whole number tells badly."""
+    """A length (m) as a fraction of the wavelength, such as λ/50; "" above λ/5, where a whole number is too coarse."""
     return f"λ/{wavelength / length:.0f}" if 0.0 < 5.0 * length <= wavelength else ""
 
 
 def with_wavelengths(text: str, length: float, wavelength: float) -> str:
-    """A text that gives a length (m), and after it in brackets what that is by the wavelength, where that tells it."""
+    """The text of a length (m), followed by the same as a fraction of the wavelength in brackets, up to λ/5."""
     share = in_wavelengths(length, wavelength)
     return f"{text} ({share})" if share else text
 
 
 def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
-    """What a bound on open-loop moves comes to: how well they repeat, and how well they are right, by what limits it.
+    """Say how well open-loop moves repeat, how accurate they are in absolute terms, and what limits that.
 
     Args:
         repeatable: 95 % bound on the largest coefficient error against the maps of the calibration, m; 0 = not known.
         calibration: its `wavelength`, `aperture_radius` (m), `instrument_error` (m) and `scale_error`.
-        curvature: for which this holds, 1/m; for a range its farther end. An error of the lateral scale counts twice
-            in the curvature.
+        curvature: for which this holds, 1/m; for a range, the end farther from 0. A relative error of the lateral scale
+            gives twice that relative error in the curvature.
     """
 
     def length(metres: float) -> str:
@@ -66,5 +66,5 @@ def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
 
 
 def with_point(text: str) -> str:
-    """A number as people write it, with a decimal comma or a typeset minus, as Python reads it."""
+    """Convert a number as people write it, with a decimal comma or a typeset minus, to Python's notation."""
     return text.replace(",", ".").replace("−", "-")

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-#: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid the nearest six, whose
-#: next ones are sqrt(3) away.
+#: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid these are the nearest
+#: six; the next ones are sqrt(3) times that distance away.
 NEIGHBOUR_DISTANCE_RATIO = 1.2
 
 
@@ -35,7 +35,7 @@ def hexagonal_positions(
     """Return the positions of a full hexagonal pattern, numbered as OKO's PDM mirrors are.
 
     Actuator 1 is the centre, 2-7 the first ring, 8-19 the second, 20-37 the third; sequential in angle within a ring.
-    Angle of the first one, sense and reflection differ from unit to unit.
+    The angle of the first one, the sense and the reflection differ from unit to unit.
 
     Args:
         actuators: 1, 7, 19, 37, ...
@@ -91,7 +91,7 @@ def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[n
 
 
 def rings(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Ring of each actuator: steps from neighbour to neighbour from the actuator nearest to the centroid (ring 0).
+    """Ring of each actuator: number of neighbour steps from the actuator nearest to the centroid (ring 0).
 
     Actuators that no chain of neighbours reaches get -1.
     """

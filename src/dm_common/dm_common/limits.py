@@ -1,4 +1,4 @@
-"""What the signals of a mirror must keep to: a range for each, and how far neighbours may differ."""
+"""Limits of the signals of a mirror: the range of each, and the difference between neighbours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,15 +13,15 @@ from dm_common import Floats
 SLACK = 1e-9
 #: Signals closer to a limit than this count as standing at it.
 AT_LIMIT = 1e-6
-#: Half-swings of a degauss that wipes the hysteresis. n of them leave up to 1 / (2 n) of the first; where that is more
-#: than a tenth, the history that follows is not the one of a mirror at rest that everybody goes by.
+#: Fewest half-swings of a degauss. With n of them up to 1 / (2 n) of the first remains; if that is more than a tenth,
+#: the state is not the demagnetised one that is assumed after a degauss.
 DEGAUSS_STEPS_MIN = 5
-#: Most half-swings: smaller ones than these leave would be below a step of the electronics.
+#: Most half-swings of a degauss: with more, the last ones would be smaller than a step of the electronics.
 DEGAUSS_STEPS_MAX = 10000
 
 
 def same_signals(one: Sequence[float] | Floats, other: Floats) -> bool:
-    """Whether two commands (N,) are the same one, but for rounding."""
+    """Whether two commands (N,) are equal up to rounding."""
     return len(one) == len(other) and float(np.abs(np.asarray(one) - other).max(initial=0.0)) <= SLACK
 
 
@@ -65,11 +65,11 @@ class Limits:
         return len(self.pairs) > 0 and self.neighbour_difference < self.high - self.low
 
     def differences(self, signals: Floats) -> Floats:
-        """(P,) by how much neighbours differ."""
+        """(P,) absolute difference between the two neighbours of each pair."""
         return np.asarray(np.abs(signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]]))
 
     def allow(self, signals: Floats) -> bool:
-        """Whether `signals` (N,) break none of the limits but by rounding."""
+        """Whether `signals` (N,) satisfy all limits, up to rounding."""
         inside = signals.min() >= self.low - SLACK and signals.max() <= self.high + SLACK
         return bool(inside) and self.allow_neighbours(signals)
 
@@ -79,7 +79,7 @@ class Limits:
         return bool(self.differences(signals).max() <= self.neighbour_difference + SLACK)
 
     def at_limit(self, signals: Floats) -> NDArray[np.bool_]:
-        """(N,) which actuators stand at a limit."""
+        """(N,) which actuators are at a limit."""
         result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
         if self.neighbours_can_bind:
             differences = self.differences(signals)
@@ -107,5 +107,5 @@ class Limits:
             factor = min(factor, self.neighbour_difference / largest)
         if factor == 1.0:
             return np.clip(signals, self.low, self.high), 1.0
-        # Rounding must not leave a value a hair above a limit that the driver checks exactly.
+        # Rounding must not leave a value slightly above a limit that the driver checks exactly.
         return np.clip(mean + factor * (1.0 - 1e-12) * departure, self.low, self.high), factor

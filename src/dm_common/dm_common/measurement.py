@@ -34,7 +34,7 @@ class Measurement:
         pitch: m per pixel; 0 = unknown.
         camera: width and height of the map, pixels; zeros = not known.
         centre: of the aperture from the left and top edge of the map, pixels; NaN = not known.
-        followed: centre of the valid region from which that of the aperture counts, as `centre`; zeros = it does not.
+        followed: centre of the valid region if the aperture follows it, as `centre`; zeros = it does not.
         radius_px: of the aperture, pixels; 0 = not known.
         orientation: how the instrument's picture was turned: flips of x and y, then counter-clockwise by degrees.
         label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``; "" = not commanded by a run.
@@ -80,22 +80,22 @@ class Measurement:
     temperature: float = float("nan")
 
     def same_map(self, other: Measurement) -> bool:
-        """Whether both are of one map: of one stamp that is known, or one file under another stamp.
+        """Whether both are the same map: the same known stamp, or the same file under another stamp.
 
-        A file that was measured may be ingested again, with the time in its header; no two maps share their
-        coefficients to the last bit.
+        A file that was already measured may be ingested again, with the time in its header; two different maps never
+        share their coefficients to the last bit.
         """
         return self.stamp_ns == other.stamp_ns != 0 or bool(np.array_equal(self.coefficients, other.coefficients))
 
 
 class Bench(Protocol):
-    """What the procedure drives."""
+    """The mirror and the interferometer that a calibration procedure drives."""
 
     def degauss(self) -> None:
         """Remove the hysteresis and end at rest. Raises Refusal."""
 
     def apply(self, signals: Floats) -> Floats:
-        """Command `signals` (N,), wait until they stand, return what was written (N,). Raises Refusal."""
+        """Command `signals` (N,), wait until they are reached, return what was written (N,). Raises Refusal."""
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         """Wait this `share` of the settle time and `dwell` s more; False when cancelled meanwhile."""

@@ -1,4 +1,4 @@
-"""Between the messages of dm_msgs and the types that several nodes share."""
+"""Conversion between the messages of dm_msgs and the types that several nodes share."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 
 
 def doubles(values: Floats) -> array[float]:
-    """`values`, flattened row by row, as a buffer that a float64[] field takes without looking at each element."""
+    """`values`, flattened row by row, as a buffer that a float64[] field accepts without checking each element."""
     return array("d", np.asarray(values, dtype=np.float64).tobytes())
 
 
 def taken(source: Any, *names: str) -> dict[str, Any]:
-    """Fields of `source` by their names, for what has them under the same."""
+    """Fields of `source` by name, for a target whose fields have the same names."""
     return {name: getattr(source, name) for name in names}
 
 
 def answer_with(answer: Any, code: int, text: str) -> None:
-    """Put code and sentence into an answer, and into the FocusState within, as far as it has a place for them."""
+    """Set code and sentence in an answer, and in the FocusState inside it, as far as they have these fields."""
     each: Any
     for each in (answer, getattr(answer, "state", None)):
         if hasattr(each, "error_code"):
@@ -91,7 +91,7 @@ def measurement_from(response: Any) -> Measurement:
     Raises:
         ValueError: the answer holds no samples, or coefficients of another convention.
     """
-    # Only those who measure ask.
+    # Imported here, since only nodes that measure need it.
     from dm_common.measurement import Measurement
     from dm_common.optics.sampling import SamplePoints
 
@@ -119,8 +119,8 @@ def measurement_from(response: Any) -> Measurement:
 
 
 def unused_as_requested(report: ActuatorState) -> ActuatorState:
-    """`report`, with what was requested of actuators without a channel as what was applied: they follow nothing, and
-    where they rest is no shape to correct or to keep.
+    """Set what was applied to actuators without a channel to what was requested of them: they cannot move, so the
+    difference is no shape to correct or to keep.
     """
     unused = np.bitwise_and(np.asarray(report.flags, dtype=np.uint8), ActuatorState.FLAG_UNUSED) > 0
     if unused.any() and len(report.requested) == len(report.applied) == len(unused):
@@ -129,7 +129,7 @@ def unused_as_requested(report: ActuatorState) -> ActuatorState:
 
 
 def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
-    """What the driver reports as applied, `heard` now (s)."""
+    """The driver's report in a message that was received at `heard` (s)."""
     signals = np.array(message.applied, dtype=np.float64)
     turned_at = np.array(message.turned_at, dtype=np.float64)
     return Applied(
@@ -145,10 +145,10 @@ def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
 
 
 def _shaped(name: str, values: array[float], *shape: int, own: bool = False) -> Floats:
-    """A field of the hysteresis model of this shape, in which -1 is any length; empty = there is none.
+    """A field of the hysteresis model in this shape (-1 = any length); empty = the model has none.
 
     Args:
-        own: whether it may be there once for each actuator.
+        own: whether it may hold one array for each actuator.
     """
     field = np.array(values, dtype=np.float64)
     if not field.size:
@@ -212,10 +212,10 @@ def estimate_message(observer: HysteresisObserver) -> ActuatorEstimateMsg:
 
 
 def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
-    """What a message says of the actuators.
+    """The estimate of the actuators in a message.
 
     Raises:
-        ValueError: its arrays are not of one mirror.
+        ValueError: its arrays do not fit together.
     """
     count = len(message.signals)
     if not count:

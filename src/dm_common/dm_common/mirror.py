@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dm_common import Floats
 from dm_common.limits import Limits
 
-#: Relative difference between the aperture radius of a calibration and the mirror's up to which it belongs to it.
+#: Largest relative difference between the aperture radii of a calibration and of the mirror that it belongs to.
 APERTURE_TOLERANCE = 0.02
 
 
@@ -88,14 +88,14 @@ class Applied:
     Attributes:
         time: s, stamp of the last write.
         signals: (N,) applied.
-        turns, turned_at: how often the way has bent since activation, and (N,) where it did last; None = never.
-        degausses: over the full range, since activation.
-        history_known: no write was lost since the last of them.
+        turns, turned_at: number of turns since activation, and (N,) signals at the last one; None = there was none.
+        degausses: number of them over the full range since activation.
+        history_known: no write was lost since the last degauss.
         moving: on the way to another shape.
         requested: (N,) what it moves to; None = not known.
         active: the electronics follow.
         linked: the electronics are in reach.
-        heard: s, when the driver said so last; what repeats a report tells that the shape still stands.
+        heard: s, when the driver last sent this; a repeated report confirms that the shape is still held.
     """
 
     time: float

@@ -1,8 +1,8 @@
-"""Recipes: what makes a shape from a defined condition (the control-parameter database of [1]).
+"""Recipes: what produces a shape from a defined condition (the control-parameter database of [1]).
 
-The condition is a mirror degaussed over the full range about mid range. What a recipe keeps is the *effective* signals
-under which the surface was the wanted one: the command that brings them about follows from the hysteresis model, at any
-later time and creep. On a mirror without an identified model they are the signals themselves.
+The condition is a mirror degaussed over the full range about mid range. A recipe stores the *effective* signals at
+which the surface had the wanted shape; the hysteresis model gives the command that produces them at any later time and
+creep. On a mirror without an identified model they are the signals themselves.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
 
-#: Begins the known limitation of a calibration in use that goes on without some actuators; recipes are of all of them.
+#: Prefix of the limitation of a calibration that is used without some actuators; recipes are of all of them.
 GOES_ON_WITHOUT = "Goes on without actuator"
 
 
@@ -34,10 +34,10 @@ class Recipe:
         effective: (N,) effective signals.
         signals: (N,) the command when it was built.
         max_zernike, rms: m, re-measured: largest coefficient error beyond tilt, sag error.
-        maps: taken to find it.
+        maps: number of maps taken to find it.
         zernike: m, added sag, as requested; () = none.
-        by_model: (N,) effective signals that the calibration gave for it then: what it has learnt since about the
-            mirror moves the recipe too; empty = not known.
+        by_model: (N,) effective signals that the calibration gave for the shape at that time: later changes of the
+            calibration shift the recipe as well; empty = not known.
     """
 
     curvature: float
@@ -52,12 +52,12 @@ class Recipe:
 
     @property
     def series(self) -> tuple[float, tuple[float, ...]]:
-        """What it has in common with shapes that differ in curvature alone: conic constant and added terms."""
+        """What it shares with shapes that differ in curvature alone: conic constant and added terms."""
         return self.conic_constant, self.zernike if any(self.zernike) else ()
 
     @property
     def shape(self) -> tuple[float, tuple[float, ...], float]:
-        """What tells it from all others: its series, and its curvature."""
+        """What identifies it among all recipes: its series, and its curvature."""
         return *self.series, self.curvature
 
 
@@ -67,7 +67,7 @@ class RecipeBook:
 
     Attributes:
         recipes: by rising conic constant, added terms, curvature.
-        degauss_steps: half-swings of the degauss that they begin with; without recipes, of those that are withheld.
+        degauss_steps: half-swings of the degauss before them; without recipes, of those that are withheld.
         interpolation_error: m, by how much the bound halfway between neighbours exceeds what was re-measured, when the
             last were built.
         stamp_ns: when the last was built.
@@ -90,7 +90,7 @@ class RecipeBook:
                 raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
 
     def check_condition(self, degauss_steps: int) -> None:
-        """Raise RecipeError when recipes that begin with so many half-swings cannot join these."""
+        """Raise RecipeError when recipes after a degauss of this many half-swings cannot join these."""
         if self.degauss_steps and degauss_steps != self.degauss_steps:
             raise RecipeError(
                 f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}: "
@@ -98,7 +98,7 @@ class RecipeBook:
             )
 
     def merged(self, newer: RecipeBook) -> RecipeBook:
-        """With the recipes of `newer` in the place of those of the same shape; its other figures are of the whole.
+        """The book with recipes of `newer` in place of those of the same shape; the other fields are those of `newer`.
 
         Raises:
             RecipeError: made under another condition.
@@ -109,7 +109,7 @@ class RecipeBook:
 
 
 def terms_text(zernike: Sequence[float]) -> str:
-    """Added terms (m), for people: in nm, those that are not zero."""
+    """Added terms (m) as text: those that are not zero, in nm."""
     terms = zip(SPOKEN, zernike, strict=True) if len(zernike) else ()
     return ", ".join(f"{name} {1e9 * value:+.4g} nm" for name, value in terms if value)
 

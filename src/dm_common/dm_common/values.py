@@ -1,4 +1,4 @@
-"""What a parameter, or a field of a request, may be: declared in tables, checked in one place. Knows no ROS."""
+"""Allowed values of parameters and of fields of requests: declared in tables, checked in one place. Knows no ROS."""
 
 import math
 import re
@@ -17,15 +17,15 @@ from dm_common.errors import ErrorCode, Refusal
 
 T = TypeVar("T")
 
-#: Most characters of a text that may name or describe anything.
+#: Most characters of a text that names or describes anything.
 TEXT_MAX = 1000
-#: What a terminal takes for an order, in a text that others read in refusals and logs.
+#: Control characters, on which a terminal would act: others read such texts in refusals and logs.
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True)
 class Value:
-    """What a value may be; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
+    """Constraints on a value; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
 
     Attributes:
         kind: bool, int, float, str, "float[]", "int[]" or "str[]".
@@ -33,9 +33,9 @@ class Value:
         low, high: allowed range of numbers (of each element for arrays), inclusive.
         unit: SI unit, "" when it has none.
         choices: allowed strings.
-        path: whether a string is a path, in which ~ must stand for a home folder.
-        zero: what 0 stands for, be it outside the range; "" = nothing in particular.
-        infinite: whether infinity is a value like others; NaN never is.
+        path: whether a string is a path, in which ~ must stand for an existing home folder.
+        zero: meaning of 0, which is then allowed even outside the range; "" = no special meaning.
+        infinite: whether infinity is allowed; NaN never is.
         sizes: numbers of elements that an array may have.
     """
 
@@ -72,7 +72,7 @@ class Value:
         return f"{kind}, {low} to {high}{' ' + self.unit if self.unit else ''}{zero}"
 
     def check(self, name: str, given: Any) -> None:
-        """Raise unless `given` may be the value of `name`; the sentence names both, and what is allowed.
+        """Raise unless `given` is an allowed value of `name`; the message names both, and what is allowed.
 
         Raises:
             Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts), INVALID_ARGUMENT (control
@@ -99,13 +99,13 @@ class Value:
             self._check_numbers(name, np.asarray(given, dtype=float), "")
 
     def _check_numbers(self, name: str, given: NDArray[np.float64], subject: str) -> None:
-        """`subject`: name and value as they were given; "" = of an array, the first that is wrong."""
+        """`subject`: name and value as they were given; "" = name the first wrong element of an array."""
         right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
         if self.zero:
             right |= given == 0.0
         if right.all():
             return
-        # NaN and infinity are named before what is merely too large.
+        # NaN and infinity are reported before values that are merely out of range.
         not_finite = ~right & ~np.isfinite(given)
         wrong = not_finite if not_finite.any() else ~right
         first, others = int(wrong.argmax()), int(wrong.sum()) - 1
@@ -148,36 +148,36 @@ def parameter(value: Value, description: str, live: bool = False, name: str = ""
     return field(default=default, metadata={"value": value, "description": description, "live": live, "name": name})
 
 
-#: One that may change while the node runs.
+#: A parameter that may change while the node runs.
 live_parameter = partial(parameter, live=True)
 
 
 def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **others: Any) -> T:
-    """The dataclass `kind` of those `values` that are called as its parameters behind `prefix`, and of `others`."""
+    """Make the dataclass `kind` from the `values` of its parameters, named with `prefix`, and from `others`."""
     own = {each.name: prefix + (each.metadata.get("name") or each.name) for each in fields(kind)}  # type: ignore[arg-type]
     given = {name: values[parameter] for name, parameter in own.items() if parameter in values}
     return kind(**{name: tuple(one) if isinstance(one, list) else one for name, one in given.items()} | others)
 
 
 class Fields:
-    """The fields of a request or goal: a table that all of them are checked by.
+    """Checks of all fields of a request or goal, by a table.
 
     Args:
-        table: {name: what it may be}; dots lead into messages within the message.
+        table: {name: allowed values}; dots lead into nested messages.
     """
 
     def __init__(self, table: Mapping[str, Value]) -> None:
-        # Each with what is right without another look: a choice, an empty array or text, a number within a range.
+        # Each with what is accepted without a full check: a choice, an empty array or text, a number within a range.
         self._rules = [
             (name, attrgetter(name), value, value.many or value.kind is str, 0 in value.sizes, *_quick(value))
             for name, value in table.items()
         ]
 
     def check(self, message: Any) -> None:
-        """Raise Refusal naming the first field that may not be as it is, its value and what is allowed."""
+        """Raise Refusal naming the first field whose value is not allowed, that value, and what is allowed."""
         for name, get, value, counted, may_be_empty, low, high in self._rules:
             given = get(message)
-            # Most are right, and a request on its way to the mirror waits for this.
+            # Most values are right, and a request on its way to the mirror waits for this.
             if value.choices:
                 right = given in value.choices
             elif counted:
@@ -189,7 +189,7 @@ class Fields:
 
 
 def _quick(value: Value) -> tuple[float, float]:
-    """Between these a value without choices is right; nothing is where the first is above the second."""
+    """Range in which a value without choices is surely right; empty if the first is above the second."""
     if value.kind not in (int, float):
         return 1.0, 0.0
     if value.infinite:
@@ -198,7 +198,7 @@ def _quick(value: Value) -> tuple[float, float]:
 
 
 def without_figures(message: Any) -> Any:
-    """`message` with NaN for all its numbers, also within: of what was refused nothing is known, and 0 is a value."""
+    """Set all numbers of `message`, nested ones too, to NaN: after a refusal none is known, and 0 would be a value."""
     for name, kind in message.get_fields_and_field_types().items():
         if kind == "double":
             setattr(message, name, math.nan)

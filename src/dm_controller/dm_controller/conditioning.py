@@ -1,7 +1,7 @@
 """A degauss on the way to a shape: which order waits for it, how long it takes, and when it has failed.
 
-A degauss that was begun goes on: a newer order takes the place of the one that waits, a cancelled one leaves the mirror
-at mid range with its history known. Steady times, s, are given with each call.
+A degauss that has begun is completed: a newer order replaces the one that waits; after a cancel the mirror is left at
+mid range with its history known. Steady times, s, are passed to each call.
 """
 
 import math
@@ -13,9 +13,9 @@ from dm_controller.focus_types import Order
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.choice import Degauss
 
-#: Half-swings that the driver does when it is not told how many, as far as can be known from here.
+#: Half-swings assumed where the driver uses its own configured number, which is not known here.
 STEPS_ASSUMED = 100
-#: Longest wait for the report of a degauss that has been answered, s.
+#: Longest wait for the driver to report a degauss that it has answered as done, s.
 REPORT_S = 2.0
 
 
@@ -27,7 +27,7 @@ class Run:
         number: of the run.
         steps: half-swings; 0 = as configured in the driver.
         began: s.
-        degausses, starts: of the driver, before it.
+        degausses, starts: counts of the driver before it.
         answered: s, when the driver said that it is done; None = not yet.
     """
 
@@ -44,7 +44,7 @@ class Conditioning:
 
     Attributes:
         run: the degauss under way; None = there is none.
-        order: that waits; None = none does.
+        order: the order that waits; None = none does.
     """
 
     def __init__(self) -> None:
@@ -55,9 +55,9 @@ class Conditioning:
         self._learnt_at = (math.nan, math.nan)  # slew rate and half the range
 
     def duration(self, steps: int, active: ActiveCalibration) -> float:
-        """Time in s that a degauss of `steps` half-swings (0 = as the driver does) takes; 0 = not known.
+        """Time in s that a degauss of `steps` half-swings (0 = as configured in the driver) takes; 0 = not known.
 
-        As the last one took; before the first from the way, which is half the span per half-swing, and the slew rate.
+        That of the last one; before the first, from the path (half the span per half-swing) and the slew rate.
         """
         slew_rate, half_span = active.planner.slew_rate, active.mirror.limits.half_range
         if (slew_rate, half_span) != self._learnt_at:  # another mirror, or another configuration
@@ -72,7 +72,7 @@ class Conditioning:
         return half_span * ((steps or STEPS_ASSUMED) + 2) / slew_rate
 
     def prospect(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
-        """The next degauss to end: the one under way, or one of as many half-swings as `configured`."""
+        """The next degauss to end: the one under way, or a new one of as many half-swings as `configured`."""
         run = self.run
         if run is None:
             steps = active.degauss_steps(configured)
@@ -80,7 +80,7 @@ class Conditioning:
         return Degauss(run.steps, True, max(0.0, self.duration(run.steps, active) - (now - run.began)))
 
     def begin(self, steps: int, monitor: DriverMonitor, now: float) -> int:
-        """A degauss begins; returns the number of the run."""
+        """Note that a degauss begins; returns the number of the run."""
         self._number += 1
         report = monitor.latest
         degausses = report.degausses if report is not None else 0
@@ -88,20 +88,20 @@ class Conditioning:
         return self._number
 
     def wait(self, order: Order) -> Order | None:
-        """Let `order` wait; returns the one whose place it takes."""
+        """Let `order` wait; returns the order that it replaces."""
         before, self.order = self.order, order
         order.pending = True
         return before
 
     def withdraw(self, order: Order) -> bool:
-        """Do not carry out `order` after all; False = it does not wait (any more)."""
+        """Do not carry out `order` after all; returns False if it does not wait (any more)."""
         waits = self.order is order
         if waits:
             self.order, order.pending = None, False
         return waits
 
     def answered(self, duration: float, now: float) -> None:
-        """The driver has answered the run under way, which took `duration` s, as done."""
+        """Note that the driver has answered the run under way, which took `duration` s, as done."""
         if self.run is not None:
             self.run.answered = now
             self._learnt[self.run.steps] = duration
@@ -114,7 +114,7 @@ class Conditioning:
         return report.degausses > run.degausses
 
     def failure(self, monitor: DriverMonitor, timeout: float, now: float) -> Refusal | None:
-        """The reason why the degauss under way will not end as it should; None = it may."""
+        """The reason why the degauss under way cannot succeed any more; None = it can."""
         run = self.run
         if run is None:
             return None
@@ -129,7 +129,7 @@ class Conditioning:
         return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone}") if gone else None
 
     def end(self) -> Order | None:
-        """The degauss has ended; returns the order that waited for it."""
+        """Note that the degauss has ended; returns the order that waited for it."""
         order, self.order, self.run = self.order, None, None
         if order is not None:
             order.pending = False

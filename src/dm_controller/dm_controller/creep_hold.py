@@ -1,12 +1,12 @@
 """Holding a shape: creep is fed forward in small corrections, as often as the shape would leave its tolerance.
 
-Creep slows down with the age of a shape, so corrections come in ever longer intervals: after an hour in minutes.
+Creep slows down with the age of a shape, so corrections come at ever longer intervals: after an hour in minutes.
 What is kept are the effective signals of the move. Each correction is the inverse of the hysteresis model from the
-state that the driver reports, so that what was rounded or cut short is made good by the next.
+state that the driver reports, so that the next correction makes good what was rounded or cut short.
 
 A shape that was set from an unknown history is held too: creep is known from the moves that were seen, and its error is
 a small part of a small correction. When the history gets lost during a hold, the hold ends: the guess that replaces the
-state says nothing of where the shape stands.
+state does not give the shape that the mirror holds.
 """
 
 import math
@@ -26,7 +26,7 @@ from dm_controller.focus_types import Moment, SendCommand
 PERIOD_S = 0.02
 #: A shape that needs no correction is checked again after this share of the time since the last command.
 CHECK_SHARE = 0.1
-#: Time for the driver to report a command as its own, s, steady; after it another publisher has overtaken it.
+#: Time for the driver to report a command as its own, s, steady; later, another publisher must have overtaken it.
 CONFIRM_S = 1.0
 
 
@@ -35,7 +35,7 @@ class CreepHold:
 
     Args:
         values: parameters `hold.*`, live.
-        monitor: knows whose shape that is, and what the driver says.
+        monitor: knows the order whose shape is held, and the driver's reports.
 
     Attributes:
         corrections: sent so far.
@@ -62,21 +62,21 @@ class CreepHold:
         return max(sent + self._values["hold.period"], order.checked + CHECK_SHARE * (order.checked - sent))
 
     def not_taken(self) -> None:
-        """The driver has not taken the last command: what stood before it is held on, if it still stands."""
+        """The driver has not taken the last command: go on holding the shape before it, if it is still there."""
         stood = self._monitor.stood
         self.end("the driver did not take the command")
         if stood is not None:
             self._monitor.order = stood
 
     def end(self, reason: str) -> None:
-        """Leave the shape as it stands, and forget the one before."""
+        """Leave the shape as it is, and forget the one before."""
         if (order := self._monitor.order) is not None:
             order.stood = None
             if order.creep_held:
                 order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
-        """What the driver reports as its last request (N,) at `now` (s, steady): the hold ends when it is another's."""
+        """Take the driver's last request (N,), reported at `now` (s, steady): if it is another's, the hold ends."""
         order = self._monitor.order
         command = order.command if order is not None else None
         if command is None or same_signals(requested, command.signals):
@@ -85,7 +85,7 @@ class CreepHold:
             self.end("another command came")
 
     def command(self, estimate: Callable[[float], ActuatorEstimate], now: Moment) -> list[SendCommand]:
-        """What is due for the shape by the driver's last report.
+        """The corrections that are due for the shape, by the driver's last report.
 
         `estimate` gives the actuators at a time, s.
         """
@@ -93,12 +93,12 @@ class CreepHold:
         if order is None or not order.creep_held or report is None or report.moving:
             return []
         if report.holder not in ("", order.request.holder):
-            return []  # goes on afterwards, if they leave the shape as it is
+            return []  # goes on afterwards if the holder leaves the shape as it is
         signals = self.correction(estimate(now.time), now.time)
         return [] if signals is None else [order.send_on(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
-        """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""
+        """The next command (N,) at `now` (s) for a mirror at rest in the state `estimate`; None = none is due."""
         order, values = self._monitor.order, self._values
         if order is None or not order.creep_held or estimate.state is None:
             return None
@@ -112,7 +112,7 @@ class CreepHold:
         if not values["hold.enable"]:
             self.end("hold.enable is false")
             return None
-        # The clock was set back.
+        # The clock may have been set back.
         command.sent = command.sent._replace(time=min(command.sent.time, now))
         order.checked = min(order.checked, now)
         if now < self.next_check:
@@ -120,7 +120,7 @@ class CreepHold:
         order.checked = now
         if planner.drift(estimate.state, now, move.effective) <= values["hold.tolerance"]:
             return None
-        # The interval to come is about as long as the one that ends; the shape is to be right in its middle.
+        # The next interval is about as long as the last one; the shape is to be right in its middle.
         ahead = 0.5 * (now - command.sent.time)
         change = planner.hold(estimate.state, now, move.effective, ahead) - estimate.state.signals
         largest = float(np.abs(change).max())

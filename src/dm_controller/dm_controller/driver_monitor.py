@@ -1,7 +1,7 @@
-"""What the driver last said, whether it still says anything, whether it took the last command, and how quickly.
+"""The driver's last report, whether reports still come, whether it took the last command, and its latency.
 
-A driver that is stopped or was killed tells nobody: its last report says for ever that it is active. So reports grow
-old here, by the steady clock, and a command that no report confirms is reported.
+A driver that is stopped or was killed sends nothing: its last report would say for ever that it is active. So reports
+age here, by the steady clock, and a command that no report confirms is reported.
 """
 
 import math
@@ -18,22 +18,22 @@ from dm_common.limits import same_signals
 from dm_common.messages import stamp_ns
 from dm_controller.focus_types import Log, Moment, Order, Progress, PublishState
 
-#: States from which a driver does not come back by itself, as it does from a lost link.
+#: States that a driver does not leave by itself, unlike a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
 #: Longest wait until the driver confirms a command where `driver_timeout` sets none, s.
 CONFIRM_S = 3.0
-#: A clock that gains so much on the steady one between two reports, s, was set, or the computer slept.
+#: A clock that gains this much on the steady one between two reports, s, was set, or the computer slept.
 CLOCK_JUMP_S = 5.0
-#: Moves over which the latency is taken.
+#: Number of moves over which the latency is taken.
 MOVES = 20
-#: A first write later than this is of another clock, or of a report that came too late, s.
+#: A first write later than this, s, is by another clock, or was reported too late.
 LATENCY_MAX_S = 1.0
-#: How an order ends whose shape somebody else replaced.
+#: Progress of an order whose shape somebody else has replaced.
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
 
 
 def _not_active(report: ActuatorState) -> Refusal:
-    """That the driver takes no commands, by the code that it answers them with itself."""
+    """The refusal for a driver that takes no commands, with the code that the driver itself would answer."""
     reason = f": {report.message}" if report.message else ""
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
         text = f"pdm_driver has lost the link to the electronics{reason}"
@@ -42,17 +42,17 @@ def _not_active(report: ActuatorState) -> Refusal:
 
 
 class DriverMonitor:
-    """Steady times, s, are given with each call.
+    """Judges the driver by its reports. Steady times, s, are passed to each call.
 
     Args:
         values: parameters `driver_timeout` and `move_timeout`.
 
     Attributes:
-        order: whose shape was commanded last; None = none was yet.
+        order: the order whose shape was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
-        starts: how often the driver was activated anew, as far as reports tell.
-        open_until: s, until when the driver counts as one that takes commands of anybody; after it ask `check`.
-        gone: what became of a driver that is known to be dead, as a sentence; "" = it may live.
+        starts: number of times the driver was activated anew, as far as reports show.
+        open_until: s, until when the driver is taken to accept commands of anybody; after that, ask `check`.
+        gone: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -63,7 +63,7 @@ class DriverMonitor:
         self.open_until = -math.inf
         self.gone = ""
         self._heard = self._gain = 0.0
-        # s, nothing gains on infinity: this clock less the steady one, and how far stamps are ahead of each of the two.
+        # s: this clock minus the steady one, and how far stamps are ahead of each; infinite until known: no gain.
         self._drift, self._ahead = math.inf, (math.inf, math.inf)
         self._stamp: int | None = None
         self._latencies: deque[float] = deque(maxlen=MOVES)
@@ -75,7 +75,7 @@ class DriverMonitor:
 
     @property
     def stood(self) -> Order | None:
-        """Whose shape the driver still reports, not having taken the last order's first command; None = nobody's."""
+        """The order whose shape is still held while the last order's first command is not taken; None = none."""
         stood, report = self.order.stood if self.order is not None else None, self.latest
         if stood is None or stood.command is None or report is None:
             return None
@@ -83,7 +83,7 @@ class DriverMonitor:
 
     @property
     def shape(self) -> Order | None:
-        """Whose shape the driver reports, be it before a correction that is on its way; None = nobody's."""
+        """The order whose shape the driver reports, possibly before a correction that is on its way; None = none."""
         order, report = self.order, self.latest
         if order is None or order.move is None or not order.kept or report is None:
             return None
@@ -91,14 +91,14 @@ class DriverMonitor:
         return order if any(same_signals(report.requested, each.signals) for each in commands) else None
 
     def lost(self, reason: str) -> None:
-        """What became of a driver that is known to be dead, as a sentence; "" = it may live."""
+        """Note what happened to a driver that is known to be dead, as a sentence; "" = it may live."""
         self.gone = reason
         self._trust()  # a parameter may have changed, too
 
     def observe(self, report: ActuatorState, now: float) -> bool:
-        """Take the driver's next report; returns whether the latency is known from now on."""
+        """Take the driver's next report; returns True if it is the first to make the latency known."""
         before, self.latest, self._heard = self.latest, report, now
-        self.gone = ""  # who reports lives
+        self.gone = ""  # a driver that reports is alive
         anew = before is not None and report.sequence < before.sequence
         self.starts += anew
         self._trust()
@@ -108,7 +108,7 @@ class DriverMonitor:
         command.confirmed = same_signals(report.requested, command.signals)
         written = stamp_ns(report.header.stamp)
         seconds = 1e-9 * (written - command.sent.ns)
-        # A driver that was active before the command was sent may have it on the way.
+        # The command may still be on its way to a driver that was active before it was sent.
         command.lost |= anew and (report.driver_state != ActuatorState.STATE_ACTIVE or written > command.sent.ns)
         if not command.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
@@ -116,11 +116,11 @@ class DriverMonitor:
         return len(self._latencies) == 1
 
     def clock_gain(self, report: ActuatorState, now: Moment) -> float:
-        """s by which this clock, or that of the stamps, has jumped ahead since the last report; a simulator's may."""
+        """s by which this clock, or that of the stamps, has jumped ahead since the last report; 0 in simulated time."""
         drift, stamp = now.time - now.steady, stamp_ns(report.header.stamp)
         gain = drift - self._drift
-        # The driver's clock may be another machine's, and a stamp is repeated for as long as the mirror stands: only
-        # one that is new tells how far ahead that clock is. It must gain on both clocks here, for one may be set back.
+        # The driver's clock may be on another machine, and a stamp is repeated while the mirror rests: only a new one
+        # shows how far ahead that clock is. It must gain on both clocks here, since one may have been set back.
         if stamp and self._stamp not in (None, stamp):
             ahead = max(0.0, 1e-9 * stamp - now.time)
             gain = max(gain, min(ahead - self._ahead[0], ahead + drift - self._ahead[1]))
@@ -130,7 +130,7 @@ class DriverMonitor:
         return self._gain
 
     def clock_jumped(self) -> list[Log]:
-        """That it did at the last report."""
+        """A warning for the log, if the clock has jumped at the last report."""
         text = f"the clock jumped {self._gain:.0f} s ahead: whether creep went on for so long counts as not known"
         return [Log("warning", text)] if self._gain else []
 
@@ -140,7 +140,7 @@ class DriverMonitor:
         self.open_until = self._heard + limit if is_open and not self.gone else -math.inf
 
     def silent(self, now: float) -> str:
-        """That the driver does not report any more, as a sentence; "" = it does, or never did."""
+        """Why the driver counts as silent, as a sentence; "" = it reports, or never did."""
         if self.gone:
             return self.gone
         limit = self._values["driver_timeout"]
@@ -150,7 +150,7 @@ class DriverMonitor:
         return f"pdm_driver has not reported for {age:.1f} s (driver_timeout {limit:g} s): is it running?"
 
     def refusal(self, now: float) -> Refusal | None:
-        """The reason why the driver, by its last report and the age of that, takes no commands; None = it does."""
+        """The reason why the driver takes no commands, by its last report and its age; None = it takes them."""
         report = self.latest
         if report is None:
             text = "no actuator_state from pdm_driver yet: is the driver running?"
@@ -167,14 +167,14 @@ class DriverMonitor:
             raise refusal
 
     def held(self, request: FocusRequest) -> Refusal | None:
-        """That somebody else holds the mirror and `request` does not take it over; None = it may have it."""
+        """The refusal if somebody else holds the mirror and `request` does not take it over; None = it may have it."""
         report = self.latest
         if report is None or report.holder in ("", request.holder) or request.take_over:
             return None
         return Refusal(ErrorCode.BUSY, report.holding)
 
     def settled(self, replaced: str = "") -> list[PublishState]:
-        """What came of the last order's command, once: the driver has confirmed it, or it is `replaced` before."""
+        """The outcome of the last order's command, once: the driver has confirmed it, or it is `replaced` before."""
         order = self.order
         if order is None or order.command is None or order.answered or not (order.command.confirmed or replaced):
             return []
@@ -184,14 +184,14 @@ class DriverMonitor:
         return [PublishState(order)]
 
     def stopped(self, now: float) -> str:
-        """The reason why what was begun with the driver will not end any more; "" = it may: a lost link comes back."""
+        """The reason why what was begun with the driver cannot end any more; "" = it can: a lost link comes back."""
         report = self.latest
         if report is not None and report.driver_state in _STOPPED and not self.gone:
             return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
         return self.silent(now)
 
     def keeps(self, order: Order) -> bool:
-        """Whether the last command is to keep the shape of `order`, be it corrected for creep."""
+        """Whether the last command keeps the shape of `order`, possibly corrected for creep."""
         last = self.order
         if order.move is None or last is None or last.move is None or not last.kept:
             return False
@@ -234,7 +234,7 @@ class DriverMonitor:
     def untaken(self, now: float) -> Refusal | None:
         """The reason why the driver has not confirmed the last command in time, once; None = there is none.
 
-        A command that went out later is the one that counts: the latest wins at the driver too.
+        Only the latest command counts, as at the driver.
         """
         command = self.order.command if self.order is not None else None
         if command is None or command.confirmed or command.given_up:

@@ -1,4 +1,4 @@
-"""How others ask for a shape: services `set_focus` and `flatten`, action `move_focus`; and the driver's degauss."""
+"""Interfaces to ask for a shape: services `set_focus` and `flatten`, action `move_focus`; the driver's degauss."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from dm_controller.focus_messages import health
 from dm_controller.focus_parameters import MOVE_FOCUS, PARAMETERS
 from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
 
-#: How often an order is looked after, s: by an action, by a service, and how often feedback is published.
+#: Polling period of an order, s, by an action and by a service; period of feedback, s.
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
-#: Longest that a confirmation takes beyond the time after which the controller itself gives a command up, s.
+#: Margin for a confirmation beyond the time after which the controller itself gives a command up, s.
 GRACE_S = 1.0
-#: Longest time after the start in which a request waits for what others have said before, s.
+#: Time after the start, s, within which a request waits for calibration, driver and clock.
 START_S = 3.0
 
 
 class FocusHost(ManagedNode, ABC):
-    """The services, actions and lifecycle of the node: one thread at a time has the controller.
+    """The services, actions and lifecycle of the node: only one thread at a time uses the controller.
 
     Args:
         on_change, keywords: see `ManagedNode`.
@@ -56,7 +56,7 @@ class FocusHost(ManagedNode, ABC):
 
     @abstractmethod
     def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
-        """The controller, for one thread at a time, and what time it is."""
+        """The controller, locked for one thread at a time, and the present time."""
 
     @abstractmethod
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
@@ -64,18 +64,18 @@ class FocusHost(ManagedNode, ABC):
 
     @abstractmethod
     def carry_out(self, effects: Iterable[Effect], now: Moment) -> None:
-        """Do what the controller says."""
+        """Carry out the effects that the controller returns."""
 
     @abstractmethod
     def state(self, order: Order) -> FocusState:
-        """What came of an order that does not change meanwhile."""
+        """The state message of an order that does not change meanwhile."""
 
     def deactivate(self) -> None:
         with self.controller() as (controller, now):
             self.carry_out(controller.rest(Refusal(ErrorCode.NODE_INACTIVE, self.inactive()), now), now)
 
     def clean_up(self) -> None:
-        self.deactivate()  # with another sentence
+        self.deactivate()  # the refusal has another text
 
     def refused(self, reason: str) -> None:
         self.deactivate()
@@ -90,20 +90,20 @@ class FocusHost(ManagedNode, ABC):
             self.carry_out(controller.degauss_answered(number, now, duration, refusal), now)
 
     def stop(self, order: Order) -> bool:
-        """Leave the move of an order where it is; False = another shape was asked for since."""
+        """Stop the move of an order where it is; returns False if another shape was asked for since."""
         with self.controller() as (controller, now):
             effects = controller.stop(order, now)
             self.carry_out(effects or (), now)
         return effects is not None
 
     def answer(self, order: Order) -> FocusState:
-        """What has come of an order so far."""
+        """The state message of an order as it is now."""
         with self._lock:
             so_far = copy(order)
         return self.state(so_far)
 
     def await_start(self) -> None:
-        """Wait for word of calibration, driver and simulated time, a moment after the start; `START_S` then at most."""
+        """Wait until calibration, driver and simulated time are known, at most until `START_S` after the start."""
         while time.monotonic() < self._started + START_S:
             with self.controller() as (controller, now):
                 refusal = controller.unavailable(now)
@@ -120,7 +120,7 @@ class FocusHost(ManagedNode, ABC):
         return self._serve(flat, request.dry_run, response)
 
     def _serve(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        """Answer in a worker thread, for the driver's confirmation is waited for."""
+        """Answer in a worker thread, because it waits for the driver's confirmation."""
         self.await_start()
         order = self.order(request, dry_run)
         deadline = time.monotonic() + GRACE_S + (self._values["driver_timeout"] or CONFIRM_S)
@@ -162,7 +162,7 @@ class MoveFocusAction:
     def _carry_out(self, handle: WorkerGoal, result: MoveFocus.Result) -> tuple[str, int, str]:
         """Outcome, ErrorCode and message of a goal; fills the state of `result`."""
         goal, node = handle.request, self._node
-        # Goals that wait for their turn may get it in another order than they came in.
+        # Goals that wait may get their turn in another order than they came in.
         if self._to_stop(handle):
             return self._stopped(handle, None)
         handle.publish_feedback(MoveFocus.Feedback(phase="planning"))
@@ -189,7 +189,7 @@ class MoveFocusAction:
         return self._follow(handle, order) or ("succeed", ErrorCode.OK, stands)
 
     def _follow(self, handle: WorkerGoal, order: Order) -> tuple[str, int, str] | None:
-        """Wait until the shape of `order` stands; None when it does."""
+        """Wait until the shape of `order` is reached; returns None when it is."""
         next_feedback = 0.0
         while True:
             with self._node.controller() as (controller, now):
@@ -212,10 +212,10 @@ class MoveFocusAction:
         return handle.is_cancel_requested or self._server.preempted(handle)
 
     def _stopped(self, handle: WorkerGoal, order: Order | None) -> tuple[str, int, str]:
-        """End a goal early, None = before it asked for anything.
+        """End a goal early; `order` None = before it asked for anything.
 
-        On cancel the mirror holds the shape it has, unless it is under way to one that was asked for since; a newer
-        goal goes on from there by itself.
+        After a cancel the mirror holds the shape it has, unless it is on its way to one that was asked for since; a
+        newer goal continues from there by itself.
         """
         with self._node.controller() as (controller, _now):
             waited = order is not None and controller.conditioning.withdraw(order)
@@ -231,11 +231,11 @@ class MoveFocusAction:
 
 
 class DegaussClient:
-    """One degauss at a time; nothing here waits.
+    """Calls the driver's degauss, one at a time; no method waits.
 
     Args:
         node: hosts the client.
-        ended: called by the executor with the number of the run, the s that it took, and the refusal; None = done.
+        ended: called by the executor with the number of the run, its duration in s, and the refusal (None = done).
     """
 
     def __init__(self, node: Node, ended: Callable[[int, float, Refusal | None], None]) -> None:
@@ -245,16 +245,16 @@ class DegaussClient:
 
     @property
     def offered(self) -> bool:
-        """Whether the driver is there and offers it."""
+        """Whether the driver is running and offers the action."""
         return bool(self._client.server_is_ready())
 
     def start(self, run: StartDegauss) -> None:
-        """Call the driver, or keep `run` until there is one."""
+        """Call the driver, or keep `run` until the driver is there."""
         self._waiting = run
         self._call()
 
     def retry(self, run: Run | None) -> None:
-        """Call the driver for a run that is kept, if it is still the one under way; to be asked now and then."""
+        """Call the driver for a run that is kept, if it is still the one under way; to be called regularly."""
         if self._waiting is not None and (run is None or run.number != self._waiting.number):
             self._waiting = None  # given up: the mirror must not swing when a driver comes back
         self._call()
@@ -265,7 +265,7 @@ class DegaussClient:
         number, steps, holder, take_over = self._waiting
         self._waiting = None
         goal = Degauss.Goal(steps=steps, holder=holder, take_over=take_over)
-        # By the executor: an answer may be there already, and then this thread would take the node's lock twice.
+        # Through the executor: if the answer is there already, this thread would take the node's lock twice.
         self._client.send_goal_async(goal).add_done_callback(
             lambda done: self._node.executor.create_task(self._accepted, number, done)
         )

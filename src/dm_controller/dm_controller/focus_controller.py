@@ -1,8 +1,8 @@
 """Open-loop focus control without ROS: requests, driver reports and time in, commands and events out.
 
 One object holds all that changes: the calibration in use, the estimate of the actuators, the shape that is held against
-creep, a degauss on the way and the order that waits for it. Whoever drives it calls one method at a time and carries
-out the effects in the order given.
+creep, a degauss under way and the order that waits for it. The caller calls one method at a time and carries out the
+effects in the order given.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,8 +34,8 @@ from dm_controller.planning.choice import Degauss, PlanningContext, choose_move,
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import REQUEST, FocusTarget
 
-#: How often a held shape is checked while no correction can be due sooner, s, and how often the estimate of the
-#: actuators is published while the mirror moves, s of wall time.
+#: Period of checks of a held shape while no correction can be due sooner, s; period of publishing the estimate of the
+#: actuators while the mirror moves, s of wall time.
 SLOW_PERIOD_S, ESTIMATE_PERIOD_S = 1.0, 0.25
 
 
@@ -50,10 +50,10 @@ class FocusController:
         not_calibrated: the reason for that.
         observer: follows the actuators.
         monitor: follows the driver.
-        hold: corrects the shape that stands for creep.
-        conditioning: a degauss on the way, and the order that waits for it.
+        hold: corrects the present shape for creep.
+        conditioning: a degauss under way, and the order that waits for it.
         requests, refused: counts since the start.
-        degauss_offered: asked whether the driver offers the action `degauss`.
+        degauss_offered: returns whether the driver offers the action `degauss`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -62,25 +62,25 @@ class FocusController:
         self.not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
         self.observer, self.monitor = HysteresisObserver(), DriverMonitor(values)
         self.hold, self.conditioning = CreepHold(values, self.monitor), Conditioning()
-        # What the last capabilities said of the driver, and the last estimate; and when the next is due, s, steady.
+        # Driver's state in the last capabilities, and last estimate; when the next estimate is due, s, steady.
         self._reported: tuple[object, ...] = ()
         self._estimated: tuple[object, ...] = ()
         self._estimate_due = 0.0
-        self._at_rest: ActuatorEstimate | None = None  # what a mirror at rest holds until its next report
+        self._at_rest: ActuatorEstimate | None = None  # of a mirror at rest, until its next report
         self.requests = self.refused = 0
         self.degauss_offered: Callable[[], bool] = lambda: False
 
     # --- what is known ---
 
     def use(self, calibration: Any, mirror: Any, recipes: Any = None) -> list[Effect]:
-        """Use a dm_msgs/Calibration, with its dm_msgs/RecipeBook, if it belongs to the dm_msgs/MirrorInfo, None = not
-        known; else refuse requests. Recipes of another calibration do not count.
+        """Use a dm_msgs/Calibration, with its dm_msgs/RecipeBook, if it belongs to the dm_msgs/MirrorInfo (None = not
+        known); otherwise refuse requests. Recipes of another calibration are ignored.
         """
         before, effects = self.active, list[Effect]()
         hold_tilt, axis = self._values["hold_tilt"], self._values["optical_axis"]
         try:
             active = active_calibration(calibration, mirror, hold_tilt, axis, recipes)
-            # A new revision leaves the shape that stands as it is: so it can be held on.
+            # A new revision leaves the present shape as it is, so the hold can continue.
             if before is None or before.calibration.id != active.calibration.id:
                 self.hold.end("another calibration is used")
             elif not before.planner.law.same_as(active.planner.law):
@@ -108,7 +108,7 @@ class FocusController:
         """Take the driver's next report."""
         report = unused_as_requested(report)
         latency_learnt = self.monitor.observe(report, now.steady)
-        with suppress(ValueError):  # the observer says so as long as the history is unknown, and begins anew
+        with suppress(ValueError):  # the observer reports it as an unknown history, and begins anew
             self.observer.observe(applied_from(report, now.time), self.monitor.clock_gain(report, now))
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
@@ -125,7 +125,7 @@ class FocusController:
         return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
 
     def _news(self, now: Moment, more: bool = False) -> list[Effect]:
-        """Publish what changed: of the driver, or there is `more`; of the actuators, of a mirror that moves seldom."""
+        """Publish what changed: of the driver (or if `more`), and of the actuators, seldom while the mirror moves."""
         refusal, observer, effects = self.unavailable(now), self.observer, list[Effect]()
         known = refusal.error_code if refusal else ErrorCode.OK, observer.unknown
         if more or self._reported != known:
@@ -174,7 +174,7 @@ class FocusController:
             degauss = Degauss(degaussed, True, 0.0)
         elif self.conditioning.run is not None or request.mode == FocusRequest.MODE_CONDITIONED or budget:
             degauss = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
-        else:  # there is no time for one: at once from where the mirror stands
+        else:  # no time for a degauss: at once, from the present state
             return active.planner.plan(target, estimate.state, now.time, not estimate.unknown, ahead=settle)
         context = PlanningContext(active, estimate, now.time, settle, degauss)
         return choose_move(target, request.mode, budget, context)
@@ -191,7 +191,7 @@ class FocusController:
                 assert active is not None  # else it is refused
                 raise unreachable(move, active, tolerance)
             if not dry_run:
-                if now.simulated and not now.ns:  # creep would take its jump for the time that the shape has stood
+                if now.simulated and not now.ns:  # creep would take the clock's jump for time at this shape
                     raise Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)
@@ -199,23 +199,23 @@ class FocusController:
                 effects += (self._go if at_once else self._condition)(order, move, now)
         except Refusal as refusal:
             if self.active is None and refusal is self.not_calibrated and not dry_run:
-                refusal = self.monitor.held(order.request) or refusal  # the first calibration runs, for example
+                refusal = self.monitor.held(order.request) or refusal  # as while the first calibration runs
             self.refused += 1
             order.refusal = refusal
             effects.append(Log("warning", f"refused: {refusal}"))
-        # What became of a command is published when the driver has said so.
+        # The outcome of a command is published once the driver has reported it.
         if not dry_run and (order.refusal is not None or order.pending):
             effects.append(PublishState(order))
         return effects
 
     def _refuse(self, order: Order, refusal: Refusal, now: Moment) -> list[Effect]:
-        """Refuse an order that was not refused at once."""
+        """Refuse an order that was not refused when it was judged."""
         self.refused += 1
         order.began, order.move, order.refusal, order.answered = now, None, refusal, True
         return [Log("warning", f"refused: {refusal}"), PublishState(order)]
 
     def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
-        """The command of `move`, whose shape is to stand from now on; until the driver has it, the one before does."""
+        """Send the command of `move`, the shape to keep from now on; until the driver has it, the one before holds."""
         order.command = SendCommand(move.signals, now, 0, order.request.holder, order.request.take_over)
         order.checked = now.time
         effects: list[Effect] = [order.command]
@@ -229,7 +229,7 @@ class FocusController:
     # --- a degauss on the way ---
 
     def _condition(self, order: Order, move: Move, now: Moment) -> list[Effect]:
-        """Have the mirror degaussed before `order` is carried out, unless it is already."""
+        """Have the mirror degaussed before `order` is carried out, unless a degauss is under way already."""
         if not self.degauss_offered():
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "action degauss: pdm_driver does not offer it (yet)")
         before, effects = self.conditioning.wait(order), list[Effect]()
@@ -245,7 +245,7 @@ class FocusController:
     def degauss_answered(
         self, number: int, now: Moment, duration: float = 0.0, refusal: Refusal | None = None
     ) -> list[Effect]:
-        """The driver has answered the degauss of run `number`: done in `duration` s, or refused."""
+        """Note that the driver has answered the degauss of run `number`: done in `duration` s, or refused."""
         if self.conditioning.run is None or self.conditioning.run.number != number:
             return []
         if refusal is not None:
@@ -267,7 +267,7 @@ class FocusController:
     def tick(self, now: Moment, driver_gone: str = "") -> list[Effect]:
         """Do what is due: creep corrections, and refusals of what the driver did not take or does not finish.
 
-        `driver_gone`: what became of a driver that is known to be dead, as a sentence; "" = it may live.
+        `driver_gone`: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
         """
         self.monitor.lost(driver_gone)
         effects: list[Effect] = []
@@ -276,7 +276,7 @@ class FocusController:
         order = self.monitor.order
         if order is not None and (untaken := self.monitor.untaken(now.steady)) is not None:
             self.hold.not_taken()
-            # A correction, or the end of a move, is no answer to the request.
+            # If the request was answered already, only a correction or the end of a move was not taken.
             effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
         effects += self._news(now)
         if not self.conditioning.run:  # a correction would end the degauss
@@ -288,7 +288,7 @@ class FocusController:
         return self.conditioning.run is not None or self.hold.next_check - now.time <= SLOW_PERIOD_S
 
     def stop(self, order: Order, now: Moment) -> list[Effect] | None:
-        """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
+        """Stop the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
         report, last = self.monitor.latest, self.monitor.order
         if last is None or not self.monitor.keeps(order):
             return None

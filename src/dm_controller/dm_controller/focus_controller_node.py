@@ -1,4 +1,4 @@
-"""Node `focus_controller`: curvature requests in, actuator commands out, with the prediction of what they will do.
+"""Node `focus_controller`: curvature requests in, actuator commands out, with a prediction of the result.
 
 Translates messages, parameters and time; what happens is decided in `dm_controller.focus_controller`.
 """
@@ -44,16 +44,16 @@ from dm_controller.focus_types import (
 from dm_controller.forecast import ForecastClient
 from dm_controller.loop_actions import serve_loops
 
-#: How often silence of the driver is noticed, s of wall time.
+#: Period of checks whether the driver is silent, s of wall time.
 STEADY_PERIOD_S = 0.5
-#: How often what the actuators have crept to is put on disk, s of wall time.
+#: Period of writing the actuators' creep to disk, s of wall time.
 RECORD_PERIOD_S = 30.0
 
 
 class FocusControllerNode(FocusHost):
     """Subscriptions and timers run in the executor, services and actions in threads of their own. See README.
 
-    While it is not active it goes on following the actuators, has no calibration in use, and sends no command.
+    While inactive, it still follows the actuators, but uses no calibration and sends no command.
     """
 
     def __init__(self, **keywords: Any) -> None:
@@ -110,7 +110,7 @@ class FocusControllerNode(FocusHost):
 
     def _keep_record(self) -> None:
         with self.controller() as (controller, now):
-            # Of a mirror that nobody reports of, the last record stands: what comes after it is in doubt.
+            # Without reports on the mirror the last record stays: what comes after it is in doubt.
             if not controller.monitor.stopped(now.steady):
                 self._recorder.keep(now.time)
 
@@ -120,7 +120,7 @@ class FocusControllerNode(FocusHost):
 
     def _on_recipes(self, message: RecipeBook) -> None:
         before, self._recipes = self._recipes, message
-        # Each message on `calibration` comes with one, which mostly brings nothing new.
+        # Each message on `calibration` comes with one here, which mostly brings nothing new.
         new = message != before and (message.recipes or before.recipes)
         if new and self._calibration is not None and message.calibration_id == self._calibration.id:
             self.activate()

@@ -1,4 +1,4 @@
-"""Between the messages of the focus controller's node and the types it works with."""
+"""Conversion between the messages of the focus controller's node and the types it works with."""
 
 import array
 import math
@@ -25,11 +25,11 @@ CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it 
 
 
 def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
-    """What came of an order, with the prediction in full.
+    """The message on the outcome of an order, with the full prediction.
 
     Args:
         values: parameters of the node.
-        share: knows of the actuators' hysteresis where the calibration does not; None = nothing does.
+        share: contribution of hysteresis where the calibration has no model of it; None = not known.
     """
     request, move, active, refusal = order.request, order.move, order.active, order.refusal
     state = without_figures(FocusState()) if move is None else FocusState()
@@ -71,7 +71,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
 
 
 def actuator_estimate_message(controller: FocusController) -> ActuatorEstimate:
-    """What is known of the actuators."""
+    """The message on the state of the actuators."""
     message, active = estimate_message(controller.observer), controller.active
     if active is not None:
         message.calibration_id, message.revision = active.calibration.id, active.calibration.revision
@@ -86,7 +86,7 @@ def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], 
 
 
 def nowhere(active: ActiveCalibration, tolerance: float) -> str:
-    """That no sphere is reachable within `tolerance` (m), as a sentence; "" = some are."""
+    """A sentence if no sphere is reachable within `tolerance` (m); "" = some are."""
     flat = FocusTarget(0.0)
     reachable = active.reachable_range(flat, tolerance)
     return flat.denied(active.certain.command(flat)[1], tolerance, reachable) if math.isnan(reachable[0]) else ""
@@ -102,13 +102,13 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
 
 
 def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -> tuple[float, float]:
-    """Of the shape of `order`, which stands: largest coefficient error that is predicted, and its 95 % bound, m."""
+    """Predicted largest coefficient error of the present shape, that of `order`, and its 95 % bound, m."""
     was, active, observer = order.active, controller.active, controller.observer
     assert was is not None  # else it had been refused
     plan, planner = move.plan, was.planner
     largest, spread = plan.max_zernike, plan.max_zernike_upper - plan.max_zernike
     if active is not None and active.calibration.id == was.calibration.id:
-        # Maps since may have shown another figure, or that the calibration errs by more than it said.
+        # Maps taken since may have shown another figure, or that the calibration has larger errors than it stated.
         planner = active.planner
         after, before = (used.mirror.predict(move.target, move.effective).max_zernike for used in (active, was))
         worse = planner.error_bound(True) ** 2 - was.planner.error_bound(True) ** 2
@@ -116,15 +116,15 @@ def _bound(controller: FocusController, order: Order, move: Move, now: Moment) -
     drift = 0.0 if order.creep_held else move.drift[0]
     if drift and observer.state is not None and observer.law.same_as(was.planner.law):
         drift = planner.drift(observer.state, now.time, move.effective)
-    # What was written again after a lost link is on another branch of the hysteresis than it was found for.
+    # A shape written again after a lost link is on another branch of the hysteresis than it was planned for.
     return largest, largest + planner.error_bound(not observer.unknown or not move.known, spread) + drift
 
 
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment, missing: str = "") -> Health:
-    """The health of the node whose parameters are `values`, and what is `missing` beside it, as a sentence.
+    """The health of the node with the parameters `values`; `missing` says what is missing beside it, as a sentence.
 
-    While the shape stands that was asked for: its curvature (1/m), for how long (s), the largest coefficient error that
-    is predicted of it and the 95 % bound on that error (m).
+    While the requested shape is held, it includes its curvature (1/m), its age (s), its predicted largest coefficient
+    error and the 95 % bound on that error (m).
     """
     figures: dict[str, object] = {
         "requests": controller.requests,
@@ -155,7 +155,7 @@ def capabilities_message(
         controller: of the mirror.
         mirror: None = not known.
         values: parameters of the node.
-        now: a driver that does not report any more by then takes no requests.
+        now: by this time it is judged whether the driver still reports.
     """
     active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
     message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)

@@ -1,4 +1,4 @@
-"""Parameters of the node `focus_controller`, and what the fields of its goals may be."""
+"""Parameters of the node `focus_controller`, and allowed values of the fields of its goals."""
 
 from dataclasses import replace
 from typing import Final
@@ -9,9 +9,9 @@ from dm_common.values import Fields, real, reals, switch, text, whole
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
 
-#: How far from the middle of the mirror a camera may look at it, m.
+#: Largest distance of the camera's axis from the middle of the mirror, m.
 AXIS_MAX = 0.1
-#: Of the closed loops, for whatever node hosts them.
+#: Parameters of the closed loops, for any node that hosts them.
 LOOP_PARAMETERS = (
     live(
         "converge.tolerance",
@@ -125,7 +125,7 @@ PARAMETERS: Final = (
     *LOOP_PARAMETERS,
 )
 
-#: What the fields of goals may be; what they request of the mirror is judged with the mirror at hand.
+#: Allowed values of the fields of goals; the shape that they request is judged with the mirror at hand.
 _TOLERANCE, _MAPS = real(0.0, 0.0, 1e-3, "m", zero="as configured"), whole(0, 1, 100, zero="as configured")
 CONVERGE = Fields({"request.holder": text(""), "method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
 BUILD_RECIPES = Fields(

@@ -1,4 +1,4 @@
-"""What goes into the focus controller and what comes out of it, without ROS."""
+"""Inputs and outputs of the focus controller, without ROS."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Moment(NamedTuple):
     """Now, by two clocks.
 
     Attributes:
-        ns: ROS time, that commands, reports and creep go by; a simulator may let it run fast, or stop it.
+        ns: ROS time, used for commands, reports and creep; a simulator may let it run fast, or stop it.
         time: the same in s.
-        steady: s, of a clock that goes on whatever ROS time does: silence and patience go by it.
-        simulated: ROS time is a simulator's, and need not go as fast as the other.
+        steady: s, of a clock that runs independently of ROS time, used for silence and time limits.
+        simulated: ROS time is simulated, and need not run as fast as the steady clock.
     """
 
     ns: int
@@ -31,17 +31,17 @@ class Moment(NamedTuple):
 
 @dataclass(eq=False)
 class SendCommand:
-    """Publish this actuator command; the controller notes in it what the driver makes of it.
+    """Publish this actuator command; the controller records in it what the driver reports of it.
 
     Attributes:
         signals: (N,)
-        sent: when; its header has the stamp.
-        expected_turns: it counts only while the driver reports so many; 0 = in any case.
-        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
-        take_over: even if somebody else holds it.
+        sent: when; the stamp of its header.
+        expected_turns: it is valid only while the driver reports this number of turns; 0 = always.
+        holder: name of the client, if somebody holds the mirror; "" = nobody in particular.
+        take_over: send it even if somebody else holds the mirror.
         confirmed: the driver reported it as its own.
-        lost: the driver was started anew since, and knows nothing of it.
-        given_up: the driver did not report it in time, and that was said.
+        lost: the driver was restarted since, and has not received it.
+        given_up: the driver did not report it in time, and this was published.
     """
 
     signals: Floats
@@ -56,26 +56,26 @@ class SendCommand:
 
 @dataclass(eq=False)
 class Order:
-    """A request on its way through the controller, which alone changes it; the last one is also the shape that stands.
+    """A request on its way through the controller, which alone changes it; the last one is the present shape.
 
-    `DriverMonitor` watches that shape come about, `CreepHold` keeps it.
+    `DriverMonitor` follows how that shape is reached, `CreepHold` keeps it.
 
     Attributes:
         request: what was asked for.
-        began: when it was judged last, or refused since; its command goes out at the same time.
+        began: when it was last judged, or refused after that; its command is sent at the same time.
         active: the calibration in use then; None = there was none.
         move: None = refused before one was planned, or after.
         unknown: the reason why the actuators' history was not known then; "" = it was.
         refusal: None = not refused.
-        pending: the mirror is degaussed first.
+        pending: it waits for a degauss.
         applied: the driver has confirmed the command.
-        answered: what came of its command has been said.
+        answered: the outcome of its command has been published.
         gap: largest distance from its shape seen, normalised.
-        command: the last one for its shape; None = none went out.
-        earlier: the one before it that the driver has confirmed: it stands until the last one, on its way, arrives.
-        creep_held: its shape is corrected for creep from its command on, until that is ended.
-        checked: s, ROS time, when creep was looked at last.
-        stood: whose shape stands on if the driver does not take the first command, until it has; None = nobody's.
+        command: the last command for its shape; None = none was sent.
+        earlier: the last confirmed command before that, which holds until the last one, on its way, arrives.
+        creep_held: its shape is corrected for creep, from its command on, until that is ended.
+        checked: s, ROS time, of the last check for creep.
+        stood: the order whose shape stays if the driver does not take the first command, until it has; None = none.
         kept: its move was not stopped.
     """
 
@@ -97,13 +97,13 @@ class Order:
     kept: bool = True
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
-        """Another command for its shape, on behalf of the same holder."""
+        """Another command for its shape, under the same holder."""
         self.earlier = self.command if self.command is not None and self.command.confirmed else self.earlier
         self.command = SendCommand(signals, now, expected_turns, self.request.holder)
         return self.command
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
-        """A command to stay where the mirror stands (N,), which quantised may break a limit by a step."""
+        """A command to stay at the present signals (N,), which after quantisation may break a limit by a step."""
         assert self.active is not None  # else nothing was commanded
         return self.send_on(self.active.mirror.limits.scaled(signals)[0], now)
 
@@ -113,7 +113,7 @@ class Progress(NamedTuple):
 
     Attributes:
         planning: the mirror is being degaussed for it.
-        share: 0 to 1 of that, or of the way.
+        share: 0 to 1, of the degauss or of the move.
         remaining: normalised distance to the shape.
         stands: the driver reports the shape.
         failed: the refusal that ended it; None = it goes on.
@@ -130,7 +130,7 @@ class Progress(NamedTuple):
 
 
 class StartDegauss(NamedTuple):
-    """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`.
+    """Have the driver degauss by `steps` half-swings (0 = as configured there), and report the end of run `number`.
 
     `holder` asks for it, "" = nobody in particular; with `take_over` even if somebody else holds the mirror.
     """
@@ -142,17 +142,17 @@ class StartDegauss(NamedTuple):
 
 
 class PublishState(NamedTuple):
-    """Publish what came of an order."""
+    """Publish the outcome of an order."""
 
     order: Order
 
 
 class PublishCapabilities(NamedTuple):
-    """What the mirror can do has changed."""
+    """Publish the capabilities of the mirror, which have changed."""
 
 
 class PublishEstimate(NamedTuple):
-    """What is known of the actuators has changed."""
+    """Publish the estimate of the actuators, which has changed."""
 
 
 class Log(NamedTuple):

@@ -1,9 +1,9 @@
-"""The residual to expect of a focus command, with an interval that knows of the actuators' hysteresis.
+"""The residual to expect of a focus command, with an interval that includes hysteresis of the actuators.
 
-An influence function predicts a residual as if actuators had no hysteresis. Service `predict_error` of the calibration
-node tells the error of a command over many histories. Its answers for some commands over the reachable range are
-fetched once per calibration, in the background; what they hold beyond the influence function's own error is the share
-of hysteresis, which then only has to be looked up.
+An influence function predicts a residual as if actuators had no hysteresis. The service `predict_error` of the
+calibration node gives the error of a command over many histories. Its answers for some commands over the reachable
+range are fetched once per calibration, in the background. Their excess over the influence function's own error is the
+share of hysteresis, which then only has to be looked up.
 """
 
 import time
@@ -26,7 +26,7 @@ from dm_controller.planning.target import FocusTarget, Shape
 GRID = 11
 #: Answers that have not come within this time are asked for again, s: the node that was asked may have died.
 RETRY_S = 10.0
-#: Answers that no later one differs from.
+#: Final answers: asking again would not change them.
 FINAL = (ErrorCode.TOO_FEW_MAPS, ErrorCode.NOT_SUPPORTED)
 
 
@@ -49,8 +49,8 @@ class HysteresisShare:
 
 
 def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
-    """Rms surface control error that figure and influence function alone predict: sag less nominal surface G s, m."""
-    from dm_controller.solvers.base import rms_sag  # a start does not wait for it
+    """Rms surface control error, m, from figure and influence function alone: sag minus nominal surface G s."""
+    from dm_controller.solvers.base import rms_sag  # not needed at the start
 
     moved = response(model, signals)
     nominal = basis(model.sample_x, model.sample_y) @ moved.coefficients
@@ -61,7 +61,7 @@ class ForecastClient:
     """Keeps the share of hysteresis for the calibration in use; nothing here waits.
 
     Attributes:
-        share: None before all answers are there, and where the calibration has no sample surfaces.
+        share: None until all answers have come, and where the calibration has no sample surfaces.
     """
 
     def __init__(self, node: Node) -> None:
@@ -74,10 +74,10 @@ class ForecastClient:
         self._pending: list[Any] = []
 
     def use(self, active: ActiveCalibration | None, tolerance: float) -> None:
-        """Have the share for a calibration fetched that does not know the hysteresis itself.
+        """Fetch the share for a calibration that has no hysteresis model itself.
 
-        Call it with every calibration and now and then: it returns at once, and when the calibration node does not
-        answer, a later call asks again.
+        Call it with every calibration and regularly: it returns at once, and if the calibration node does not answer, a
+        later call asks again.
 
         Args:
             active: the calibration in use; None = none.

@@ -25,7 +25,7 @@ from dm_controller.planning.planner import Move
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
 
-#: What requests are told while a goal of an action runs.
+#: Text of refusals while a goal of an action runs.
 BUSY = {
     "converge": "a closed loop (action converge) is running",
     "build_recipes": "recipes are being built (action build_recipes)",
@@ -35,13 +35,13 @@ OUTCOMES: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "cancel
 
 
 def loop_times(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What `BenchServices` goes by, from the parameters of the node; these may change while it rests."""
+    """The settings of `BenchServices`, from the parameters of the node, which may change while it is inactive."""
     own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
     return own | {"degauss_timeout": values["recipes.degauss_timeout"]}
 
 
 class LoopBench(BenchServices):
-    """Driver and interferometer, for one goal of either action at a time; and what the focus controller knows.
+    """Driver and interferometer for one goal of either action at a time, with what the focus controller knows.
 
     Args:
         node: the hosting node.
@@ -70,13 +70,13 @@ class LoopBench(BenchServices):
     ) -> tuple[str, int, str]:
         """Outcome, ErrorCode and sentence of a goal of the action `name`, which has the bench for itself.
 
-        Its cancellation ends waits, and its feedback says what is waited for.
+        Its cancellation ends waits, and its feedback reports what is waited for.
 
         Args:
-            asked: says who asks, see `BenchServices.held`.
+            asked: the goal or request, which names the client, see `BenchServices.held`.
             body: carries the goal out.
             needed: a node that the goal needs besides driver and interferometer.
-            history: whether a map counts only where the driver knows the actuators' history as it did before.
+            history: whether a map is valid only if the driver has known the actuators' history since the degauss.
         """
         busy = "a closed loop or a run of recipes is under way; cancel it first, or take the mirror over"
         timeout = self.parameters["converge.driver_timeout"]
@@ -116,7 +116,7 @@ class LoopBench(BenchServices):
             return controller.active
 
     def hysteresis(self) -> HysteresisState | None:
-        """What is known of the actuators; None = nothing."""
+        """Estimated state of the actuators; None = not known."""
         with self._host.controller() as (controller, now):
             return controller.observer.estimate(now.time).state
 
@@ -125,7 +125,7 @@ class LoopBench(BenchServices):
         return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
 
     def check_ready(self) -> None:
-        """As of the driver, and wait until ROS time runs. Raises ClockError where it does not."""
+        """Check the driver, and wait until ROS time runs. Raises ClockError if it does not."""
         super().check_ready()
         wait_for_clock(self._node.get_clock())
 
@@ -134,14 +134,14 @@ class LoopBench(BenchServices):
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def applied(self) -> Floats | None:
-        """(N,) signals at which the driver says that the mirror stands; None = it does not say."""
+        """(N,) signals that the driver reports as applied; None = it reports none."""
         applied = np.array(self.state.applied if self.state is not None else (), dtype=np.float64)
         return applied if applied.size and np.isfinite(applied).all() else None
 
     def degauss(self, steps: int = 0) -> None:
-        """The condition that recipes begin with: the driver's own number of steps may be another."""
+        """Make the condition that recipes begin with; the driver's own number of steps may differ."""
         super().degauss(steps or int(self.parameters["recipes.degauss_steps"]))
-        self._history_known = self._by_history  # from here on: what is lost before the first map counts as well
+        self._history_known = self._by_history  # from here on, so that a loss before the first map counts too
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
@@ -159,7 +159,7 @@ class LoopBench(BenchServices):
 
 
 def serve_loops(node: FocusHost, values: Mapping[str, Any]) -> None:
-    """Offer both actions, one goal at a time. What they run is loaded with the first goal: most mirrors never see one.
+    """Offer both actions, one goal at a time. Their code is loaded with the first goal: most mirrors never need it.
 
     Args:
         node: the hosting node.

@@ -1,4 +1,4 @@
-"""What may be asked of the drive electronics, from any thread: enable, command, degauss, disable.
+"""Commands to the drive electronics, from any thread: enable, command, degauss, disable.
 
 The latest command wins. A move is cut into steps by the safety limiter and written by `dm_driver.writer_thread`.
 """
@@ -10,25 +10,25 @@ from dm_driver.moves import Kind, Move, Outcome
 from dm_driver.safety_limiter import Shape, largest_change
 from dm_driver.writer_thread import WriterThread
 
-#: Ends of the way to the safe shape after which the mirror stands where a driver brought it.
+#: Outcomes of the move to the safe shape after which the mirror is where a command brought it.
 _UNDER_CONTROL = (Outcome.REACHED, Outcome.SUPERSEDED)
 
 
 class ActuatorWriter(WriterThread):
-    """Write shapes to a drive unit, within the limits. Made from what its base class takes."""
+    """Writes shapes to a drive unit, within the limits. Takes the arguments of its base class."""
 
     def wait_for_link(self, timeout_s: float) -> bool:
-        """Whether the link stands, now or within `timeout_s`."""
+        """Whether the link is up, now or within `timeout_s`."""
         with self._change:
             return self._change.wait_for(lambda: self._link_up or self._stopping, timeout_s) and self._link_up
 
     def enable(self, timeout_s: float) -> bool:
         """Allow writes; the mirror goes to the safe shape first. Returns whether it got there within `timeout_s`.
 
-        No unit can be read back. The way begins at what was written last, by this object or as `last` recorded it of
-        another: that shape is written again, then the ramp follows. When nothing is known, there is nothing to ramp
-        from and the safe shape is written in one step. Without a link this happens as soon as the link stands, and a
-        link that is lost on the way only delays it; an accepted command takes its place.
+        No unit can be read back. The ramp begins at the shape written last, by this object or, according to `last`, by
+        another: that shape is written again, then the ramp follows. If nothing is known, there is nothing to ramp from,
+        and the safe shape is written in one step. Without a link this happens as soon as the link is up, and a link
+        lost on the way only delays it; an accepted command replaces it.
         """
         move: Move | None = None
         with self._change:
@@ -46,7 +46,7 @@ class ActuatorWriter(WriterThread):
         if move is None or not written:
             return written
         limit = time.monotonic() + timeout_s + self._limiter.ramp_time(start, self._safe_shape)
-        # Without a link nobody waits for what goes on when it is back.
+        # Without a link there is no point in waiting: the move continues once the link is back.
         while (outcome := move.wait(0.02)) is None and self._link_up and time.monotonic() < limit:
             pass
         return outcome in _UNDER_CONTROL  # a command that came meanwhile is as good: the way to it is a ramp too
@@ -54,7 +54,7 @@ class ActuatorWriter(WriterThread):
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.
 
-        A unit may take its frames slower than the limits allow: it is given up when it has taken none for `timeout_s`.
+        A unit may take its frames more slowly than the limits allow; it is given up when it takes none for `timeout_s`.
         """
         with self._change:
             self._accepting = False
@@ -76,7 +76,7 @@ class ActuatorWriter(WriterThread):
         return outcome or Outcome.STOPPED
 
     def command(self, shape: Shape) -> Move:
-        """Go to `shape`, which `SafetyLimiter.check_shape` has passed; a move under way is left for it.
+        """Move to `shape`, which `SafetyLimiter.check_shape` has passed; a move under way is abandoned for it.
 
         Raises:
             Refusal: DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
@@ -84,7 +84,7 @@ class ActuatorWriter(WriterThread):
         return self.submit(Move(Kind.COMMAND, shape))
 
     def submit(self, move: Move) -> Move:
-        """Begin `move`, a legal way such as `degauss_move` makes; the one under way is left for it. Returns it.
+        """Begin and return `move`, a legal one such as `degauss_move` makes; the one under way is abandoned for it.
 
         Raises:
             Refusal: DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
@@ -101,9 +101,9 @@ class ActuatorWriter(WriterThread):
             return move
 
     def correct(self, shape: Shape, turns: int) -> Move | None:
-        """As `command`, but only while the mirror rests after so many `turns`.
+        """As `command`, but only if the mirror rests and has made exactly this number of `turns`.
 
-        Returns None, and does nothing, when something else was asked for since: a correction must not undo it.
+        Returns None, and does nothing, if another command came since: a correction must not undo it.
         """
         with self._change:
             if self._queue.newest is not None or self._queue.turns != turns:
@@ -112,9 +112,9 @@ class ActuatorWriter(WriterThread):
             return self.command(shape)
 
     def turn_back(self, move: Move, halt: bool = False) -> Move | None:
-        """Leave `move` for the shape that was requested before it, with `halt` for where the mirror is, within a step.
+        """Abandon `move` for the shape requested before it; with `halt`, for the present place, within a step.
 
-        Returns the way there; None = something else was asked for since.
+        Returns the move back; None = another command came since.
         """
         with self._change:
             target = self._shape if halt else move.before

@@ -11,7 +11,7 @@ from dm_common.values import real, whole
 from dm_driver.moves import Kind, Move
 from dm_driver.safety_limiter import DriverLimits, Shape
 
-#: A degauss of at least this share of the full range leaves nothing of what was before.
+#: Share of the full range from which on a degauss wipes all earlier history.
 FULL_CYCLE = 0.999
 
 
@@ -50,7 +50,7 @@ def degauss_move(
         steps: half-swings.
         end: (N,) signals to end in.
         duration_max: s, longest time that it may take.
-        name: of what gave `steps`, for the refusal.
+        name: of the parameter or field that gave `steps`, for the refusal.
 
     Raises:
         Refusal: NOT_FINITE or OUT_OF_RANGE.
@@ -60,8 +60,8 @@ def degauss_move(
     real(0.0, 0.0, largest).check("amplitude", amplitude)
     whole(0, 1, DEGAUSS_STEPS_MAX).check(name, steps)
     swing = amplitude or largest
-    # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
-    # On a slow line the last step of each of these ways takes as long as a whole one.
+    # The swings add up to steps * swing; the moves to the first one and to the end take at most the whole range each.
+    # On a slow line the last step of each of these moves takes as long as a whole one.
     duration = (steps * swing + 4.0 * largest) / limits.slew_rate + (steps + 2) / limits.frames_per_second
     if not duration <= duration_max:
         line = "" if math.isinf(limits.frames_per_second) else f" and {limits.frames_per_second:.4g} frames per second"
@@ -71,6 +71,6 @@ def degauss_move(
             f"must be at most {duration_max:g} s (degauss.duration_max)",
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
-    # A smaller cycle leaves what wider swings have written.
+    # A smaller cycle does not wipe the effect of wider swings.
     wipes = swing >= FULL_CYCLE * largest and steps >= DEGAUSS_STEPS_MIN
     return Move(Kind.DEGAUSS, end, waypoints, wipes, steps, duration)

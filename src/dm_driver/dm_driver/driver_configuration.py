@@ -1,4 +1,4 @@
-"""From parameter values to the parts of the driver; everything that can contradict itself is found here."""
+"""Builds the parts of the driver from parameter values, and finds contradictions between them."""
 
 import math
 from collections.abc import Mapping
@@ -63,7 +63,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         timeout_s=values["electronics.timeout"],
         frame=from_values(FrameFormat, values if kind == "framed_serial" else {}, "framed_serial."),
     )
-    back_end = BACK_ENDS[kind](settings)  # finds a missing setting now
+    back_end = BACK_ENDS[kind](settings)  # raises if a setting is missing
     unit = tuple(values[f"volts.{name}"] for name in ("dac_at_zero", "dac_at_full", "amplifier_gain"))
     if not back_end.knows_volts and unit != (0.0, 1.0, 1.0):
         raise ValueError(

@@ -8,8 +8,8 @@ from dm_common.ros.lifecycle import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.moves import WriterState
 
-#: A unit that has not answered for so long after the configuration is missing, s; before, it is awaited: the driver may
-#: have been started first.
+#: A unit that has not answered this long after the configuration is missing, s; until then it is awaited, since the
+#: driver may have been started first.
 AWAIT_S = 15.0
 
 
@@ -35,7 +35,7 @@ class LinkLog:
         missing = self._up or now - self._began > AWAIT_S
         severity = "error" if missing else "info"
         text = f"{state.fault}; {'trying again' if missing else 'waiting for the drive electronics'}"
-        # While they are awaited, how exactly they do not answer is of no interest.
+        # While the unit is awaited, the exact error is of no interest.
         key = text if missing else "awaited"
         self._up, before, self._logged = False, self._logged, key
         if missing:
@@ -46,8 +46,8 @@ class LinkLog:
 def driver_health(
     writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int], trouble: str = ""
 ) -> Health:
-    """Judge the driver: level, one line for a person, and counts: of refusals since the start, else since the
-    configuration.
+    """Judge the driver: level, one line for a person, and counts (refusals since the start, others since the
+    configuration).
 
     Args:
         writer: None when the driver is not configured.

@@ -1,4 +1,4 @@
-"""The messages of `pdm_driver`, from the ROS-free parts."""
+"""Makes the messages of `pdm_driver` from its ROS-free parts."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What was last sent to the electronics, kept where a killed driver cannot take it along.
+"""Record on disk of what was last sent to the electronics, which survives a killed driver.
 
 No unit can be read back, and its outputs hold when the driver dies. A new driver that knows nothing must write its
-first shape in one step; one that finds this record goes on from where the old one ended. A shape is recorded *before*
-it is sent: what stands at the outputs is then the record or at most one step away from it. Its numbers are the codes
-that it becomes, not rounded: they stand for the same outputs when the volts of the signals are configured anew.
+first shape in one step; one that finds this record continues from where the old one ended. A shape is recorded *before*
+it is sent: the outputs are then at the record or at most one step away from it. The record holds codes that are not
+rounded: they stand for the same outputs when the volts of the signals are configured anew.
 
-Two slots are written in turn, each with a check sum, so that one is whole at any moment. The operating system keeps
+Two slots are written in turn, each with a checksum, so that one is complete at any moment. The operating system keeps
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
 """
 
@@ -50,10 +50,10 @@ class LastShape:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
 
     def claim(self) -> None:
-        """Keep other drivers of this record from the unit, until :meth:`close` or the end of the process.
+        """Keep other drivers with this record away from the unit, until :meth:`close` or the end of the process.
 
         Raises:
-            LinkError: one has it. A unit on UDP would take the frames of both.
+            LinkError: another driver has it. A unit on UDP would take the frames of both.
         """
         try:
             if self._descriptor >= 0:
@@ -64,7 +64,7 @@ class LastShape:
             return
 
     def load(self) -> Shape | None:
-        """(N,) codes, the newest whole record; None when there is none for this number of actuators, or when it was
+        """(N,) codes of the newest complete record; None if there is none for this number of actuators, or if it was
         noted or loaded by this object before.
 
         Raises:
@@ -80,7 +80,7 @@ class LastShape:
         return newest
 
     def known(self, own: Shape | None, scale: VoltScale, limiter: SafetyLimiter) -> Shape | None:
-        """(N,) where the outputs stand: as another driver left them since, else `own`; None = unknown."""
+        """(N,) shape at the outputs: as another driver has left it since, else `own`; None = unknown."""
         try:
             if (codes := self.load()) is not None:
                 return limiter.check_shape(scale.signals_of_codes(codes), "what was sent last")
@@ -101,7 +101,7 @@ class LastShape:
         os.pwrite(self._descriptor, content + _CHECK.pack(zlib.crc32(content)), self._slot * (self._number % 2))
 
     def close(self) -> None:
-        """Forget the file; what is in it stays."""
+        """Close the file; its content stays."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
@@ -116,7 +116,7 @@ class LastShape:
 
 
 def record_path(folder: str, *names: object) -> Path | None:
-    """The file in `folder` for the unit and mirror that `names` tell apart; None for an empty folder name."""
+    """The file in `folder` for the unit and mirror that `names` identify; None for an empty folder name."""
     if not folder:
         return None
     stem = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", str(name)).strip("-.") for name in names)

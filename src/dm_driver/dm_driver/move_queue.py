@@ -1,4 +1,4 @@
-"""The move under way, the newest one behind it, and what the mirror's hysteresis remembers of their ends."""
+"""The move under way, the newest one waiting behind it, and the turning points that hysteresis depends on."""
 
 from collections.abc import Iterator
 
@@ -7,18 +7,18 @@ from dm_driver.safety_limiter import SafetyLimiter, Shape
 
 
 class MoveQueue:
-    """Which shape comes next. It has no lock of its own: the writer's guards it.
+    """Decides which shape comes next. It has no lock of its own: the writer's guards it.
 
     Attributes:
-        pending: the newest move, which waits for the writer; a newer one takes its place.
+        pending: the newest move, waiting for the writer; a newer one replaces it.
         current: the move under way.
         next_shape: (N,) the next step of `current`.
         under_way: whether `current` has written a step.
-        requested: (N,) where the last accepted move leads.
+        requested: (N,) target of the last accepted move.
         history_known: every write since a completed degauss over the full range went through.
-        degausses: such degausses since the writer was enabled.
-        turns: moves that ended or were left for another since the writer was enabled.
-        turned_at: (N,) what was applied where that happened last.
+        degausses: number of such degausses since the writer was enabled.
+        turns: number of moves that ended or were abandoned for another since the writer was enabled.
+        turned_at: (N,) what was applied at the last of these turns.
     """
 
     def __init__(self, limiter: SafetyLimiter) -> None:
@@ -32,7 +32,7 @@ class MoveQueue:
         self.forget_history()
 
     def forget_history(self) -> None:
-        """Begin anew: nothing is known of what was written before."""
+        """Start afresh: nothing is known of what was written before."""
         self.history_known = False
         self.degausses = self.turns = 0
         self.turned_at: Shape | None = None
@@ -43,21 +43,21 @@ class MoveQueue:
         return self.pending or self.current
 
     def put(self, move: Move) -> None:
-        """Let `move` be the next."""
+        """Make `move` the next one."""
         newest = self.newest
-        # The mirror never held the end of a degauss that is left.
+        # The mirror never held the end of a degauss that is abandoned.
         move.before = newest.before if newest is not None and newest.kind is Kind.DEGAUSS else self.requested
         if self.pending is not None:
             self.pending.finish(Outcome.SUPERSEDED)
         self.pending, self.requested = move, move.target
 
     def begin(self, move: Move, shape: Shape, applied: Shape | None) -> None:
-        """Leave the current move for `move`.
+        """Abandon the current move for `move`.
 
         Args:
             move: the next.
             shape: (N,) that was written last, before quantisation.
-            applied: (N,) what stands at the actuators; None before the first write.
+            applied: (N,) what is at the actuators; None before the first write.
         """
         if self.current is not None:
             self.current.finish(Outcome.SUPERSEDED)
@@ -85,7 +85,7 @@ class MoveQueue:
         return True
 
     def end_all(self, outcome: Outcome, shape: Shape | None, keep: Move | None = None) -> None:
-        """End all moves but `keep`, which begins anew, where the mirror stands: `shape` (N,) as it was written last."""
+        """End all moves but `keep`, which begins again from the present place: `shape` (N,), as written last."""
         for move in (self.pending, self.current):
             if move is not None and move is not keep:
                 move.finish(outcome)
@@ -94,6 +94,6 @@ class MoveQueue:
             self.requested = shape
 
     def _turn(self, applied: Shape | None) -> None:
-        """The way bends where the mirror now stands: hysteresis depends on these places only."""
+        """Note a turning point where the mirror now is: hysteresis depends on these only."""
         self.turns += 1
         self.turned_at = applied

@@ -1,4 +1,4 @@
-"""What the actuator writer is asked to do, and what it reports about itself."""
+"""The moves that the actuator writer carries out, and what it reports about itself."""
 
 import threading
 from collections.abc import Iterable, Iterator
@@ -30,7 +30,7 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Move:
-    """A way through legal shapes; its end can be waited for.
+    """A path through legal shapes; its end can be waited for.
 
     Attributes:
         kind: what it is for.
@@ -38,8 +38,8 @@ class Move:
         waypoints: shapes to pass, the target last; straight lines between them. None = straight to the target.
         wipes: a degauss over the full range by enough half-swings, which wipes the hysteresis.
         steps, duration: of a degauss: its half-swings, and how long they take, s.
-        begun: waypoints that the mirror is past, or on its way to.
-        before: (N,) where the last accepted move led when this one was put in its place; where that was a degauss, what
+        begun: number of waypoints that the mirror has passed or is heading for.
+        before: (N,) target of the last accepted move when this one replaced it; if that was a degauss, the shape that
             it would have turned back to; None before the first.
     """
 
@@ -74,7 +74,7 @@ class Move:
 
 @dataclass
 class Counters:
-    """What happened since the writer was made."""
+    """Counts since the writer was made."""
 
     frames: int = 0
     link_losses: int = 0
@@ -91,15 +91,15 @@ class WriterState:
         link_up: the electronics are open.
         enabled: writes are allowed.
         moving: kind of the move under way; None when the mirror rests or the link is down.
-        requested: (N,) where the last accepted move leads; None before the first write.
-        applied: (N,) what stands at the actuators, after quantisation; None before the first write.
+        requested: (N,) target of the last accepted move; None before the first write.
+        applied: (N,) what is at the actuators, after quantisation; None before the first write.
         volts: (N,) V at the actuators for `applied`.
         stamp_ns: when `applied` was written, in the caller's clock.
         sequence: writes since the writer was enabled.
         history_known: every write since a completed degauss over the full range went through.
-        degausses: such degausses since the writer was enabled.
-        turns: moves that ended or were left for another since the writer was enabled.
-        turned_at: (N,) what was applied where that happened last; None before the first.
+        degausses: number of such degausses since the writer was enabled.
+        turns: number of moves that ended or were abandoned for another since the writer was enabled.
+        turned_at: (N,) what was applied at the last of these turns; None before the first.
         fault: reason why the link is down; empty when it is up.
     """
 

@@ -32,7 +32,7 @@ from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.last_shape import LastShape, record_path
 from dm_driver.moves import Move, Outcome, WriterState
 
-#: Shortest time between two state messages in the middle of a ramp.
+#: Shortest time between two state messages in the middle of a ramp, s.
 STATE_INTERVAL_S = 0.02
 
 
@@ -46,7 +46,7 @@ class PdmDriverNode(ManagedNode):
         self._hold = MirrorHold(time.monotonic)
         self._gate = CommandGate(self._hold, self._on_gate)
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
-        # Guards publishing: state leaves the executor's, the writer's and the services' threads.
+        # Guards publishing, which happens in the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
         self._link_log = LinkLog(time.monotonic())
         self._published_at = 0.0
@@ -79,7 +79,7 @@ class PdmDriverNode(ManagedNode):
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
-        self._timer.reset()  # else the period that has begun goes on, a minute perhaps
+        self._timer.reset()  # else the period that has begun would continue, up to a minute
         self._gate.configuration = configuration
         self._gate.refusal, self._gate.trouble = None, ""
         self._gate.writer = ActuatorWriter(
@@ -101,7 +101,7 @@ class PdmDriverNode(ManagedNode):
         self._publish_state()
 
     def _last_shape(self, configuration: DriverConfiguration) -> LastShape:
-        """The record of what was last sent to this unit; an empty one where none can be kept."""
+        """The record of what was last sent to this unit; an empty one if none can be kept."""
         settings, actuators = configuration.settings, configuration.limiter.limits.actuators
         place = settings.serial_port or f"{settings.address}-{settings.port}"
         names = self._values["electronics.kind"], place, self._values["mirror.serial"]
@@ -206,7 +206,7 @@ class PdmDriverNode(ManagedNode):
         return response
 
     def _on_gate(self, text: str, took_over: bool) -> None:
-        """A command was refused, or took the mirror over, which no flood of refusals may hide."""
+        """A command was refused, or took the mirror over; a flood of refusals must not hide the latter."""
         if took_over:
             self.get_logger().warning(text)
         else:
@@ -233,14 +233,14 @@ class PdmDriverNode(ManagedNode):
             self.get_logger().info(news[1])
 
     def _periodic(self) -> None:
-        """Periodically: a unit that never answers changes nothing, and is missing all the same."""
+        """Report periodically: a unit that never answers causes no change of state, but is missing all the same."""
         if (writer := self._gate.writer) is not None:
             self._log_link(writer.state())
         self._publish_state()
 
     def _publish_state(self) -> None:
         with self._state_lock:
-            if not self.context.ok():  # on the way out nobody is left to publish to
+            if not self.context.ok():  # when the process ends, nobody is left to publish to
                 return
             gate, writer, configuration = self._gate, self._gate.writer, self._gate.configuration
             if writer is None or configuration is None:

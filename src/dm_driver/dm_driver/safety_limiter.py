@@ -1,4 +1,4 @@
-"""What a command must satisfy before it reaches the electronics, and how a large move is cut into small writes.
+"""Checks of commands before they reach the electronics, and the division of large moves into small writes.
 
 The legal shapes are those with every signal in range and no two neighbours further apart than allowed. Both conditions
 are convex: a straight line between two legal shapes stays legal. A move is therefore a straight line cut into equal
@@ -18,7 +18,7 @@ from dm_common.values import parameter, real
 
 Shape = NDArray[np.float64]
 
-#: Interpolation rounds once more, so the check in front of the write is wider by this.
+#: Margin of the check before the write, for the additional rounding of interpolation.
 _ROUNDING = 1e-12
 
 
@@ -56,13 +56,13 @@ class DriverLimits(Limits):
 
 
 class SafetyLimiter:
-    """Judge commands and plan moves within `DriverLimits`. Holds no state: the caller says where the mirror stands."""
+    """Judge commands and plan moves within `DriverLimits`. Holds no state: the caller says where the mirror is."""
 
     def __init__(self, limits: DriverLimits) -> None:
         self.limits = limits
 
     def check_shape(self, signals: ArrayLike, name: str = "signals") -> Shape:
-        """Return `signals` as a legal shape (a copy, rounding beyond the range cut off).
+        """Return `signals` as a legal shape (a copy, with rounding errors beyond the range cut off).
 
         Raises:
             Refusal: INVALID_LENGTH, NOT_FINITE, OUT_OF_RANGE or NEIGHBOUR_DIFFERENCE.
@@ -106,7 +106,7 @@ class SafetyLimiter:
         `previous` is what was written before; None when the outputs are unknown, so that no step can be judged.
 
         Raises:
-            Refusal: each is a defect of the caller.
+            Refusal: any refusal here is a defect of the caller.
         """
         limits = self.limits
         if shape.shape != (limits.actuators,):
@@ -135,7 +135,7 @@ class SafetyLimiter:
         yield target
 
     def path(self, start: Shape, waypoints: Iterable[Shape]) -> Iterator[Shape]:
-        """Yield the shapes to write on the way from `start` through all `waypoints` (legal but for rounding)."""
+        """Yield the shapes to write on the way from `start` through all `waypoints` (legal up to rounding)."""
         for waypoint in waypoints:
             target = np.clip(waypoint, self.limits.low, self.limits.high)
             yield from self.ramp(start, target)
@@ -149,7 +149,7 @@ class SafetyLimiter:
         """Seconds from the first to the last write of a move."""
         change = largest_change(start, target)
         steps = max(1, math.ceil(change / self.limits.step - SLACK))
-        # A short step waits for the line all the same.
+        # Even a short step takes one frame of the line.
         return (steps - 1) * max(change / steps / self.limits.slew_rate, 1.0 / self.limits.frames_per_second)
 
     def _check_neighbours(self, shape: Shape, name: str, slack: float) -> None:
@@ -180,7 +180,7 @@ class Watchdog:
         self.deadline = math.inf
 
     def feed(self, now: float) -> None:
-        """A fresh command came at `now` (s of any steady clock)."""
+        """Note that a fresh command came at `now` (s of any steady clock)."""
         if self._period_s > 0.0:
             self.deadline = now + self._period_s
 
@@ -193,7 +193,7 @@ class Watchdog:
 
 
 def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: NDArray[np.bool_], rule: str) -> None:
-    """Raise Refusal naming the first of the actuators `at_fault` (N,) and the rule it breaks; nothing where none is."""
+    """Raise Refusal naming the first of the actuators `at_fault` (N,), if any, and the rule it breaks."""
     if at_fault.any():
         first, others = int(at_fault.argmax()), int(at_fault.sum()) - 1
         text = f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}"

@@ -1,8 +1,8 @@
 """The one thread that owns the drive electronics.
 
-It writes one step of the current move after the other, paced so that the slew rate holds, and leaves a move at once for
-a newer one. After a lost link it tries to reconnect once a second, then writes the last shape again and goes on to the
-safe shape where it was on its way there. Where another driver had the unit, it begins where that one ended.
+It writes one step of the current move after the other, paced so that the slew rate holds, and abandons a move at once
+for a newer one. After a lost link it tries to reconnect once a second, then writes the last shape again and continues a
+move to the safe shape. If another driver had the unit meanwhile, it begins where that one ended.
 """
 
 import logging
@@ -22,13 +22,13 @@ from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog
 
 RECONNECT_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
-#: A link that opened counts as standing when it still does after this time: a busy EDAC40 accepts a second TCP client
-#: only to close it, and a datagram's "port unreachable" takes a moment to return.
+#: A link counts as up if it still is this long after it opened, s: a busy EDAC40 accepts a second TCP client only to
+#: close it, and a datagram's "port unreachable" takes a moment to return.
 CONFIRM_S = 0.05
 
 
 class WriterThread:
-    """Keep the link and write what the queue holds; `dm_driver.actuator_writer` puts moves there.
+    """Keeps the link and writes what the queue holds; `dm_driver.actuator_writer` puts moves there.
 
     Args:
         electronics: the unit; opened, used and closed by this object's thread only.
@@ -39,7 +39,7 @@ class WriterThread:
             write in the middle of a move, True for everything else. Must return soon.
         watchdog_s: without a command for this long the mirror goes to `safe_shape`; 0 = never.
         stamp_ns: the clock that `WriterState.stamp_ns` is taken from.
-        last: what an earlier driver of this unit sent last, and where this one notes what it sends.
+        last: record of what an earlier driver of this unit sent last; this one notes there what it sends.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class WriterThread:
         self._last.claim()
         self._electronics.open()
         if self._rewrite_due:
-            self._confirm()  # first, for what is sent is recorded: a busy unit stands where its own driver puts it
+            self._confirm()  # first, since what is sent is recorded, and a busy unit is where its own driver puts it
             with self._change:
                 if due := self._rewrite_due and not self._stopping:  # it may have been disabled meanwhile
                     own, self._shape = self._shape, self._last.known(self._shape, self._output.scale, self._limiter)
@@ -203,7 +203,7 @@ class WriterThread:
         self._electronics.check()
 
     def _rewrite(self) -> None:
-        """Write the last shape (after `enable` the safe one) in one step; what stands at the outputs is unknown."""
+        """Write the last shape (after `enable` the safe one) in one step, as the shape at the outputs is unknown."""
         with self._change:
             shape = self._shape
         assert shape is not None
@@ -221,7 +221,7 @@ class WriterThread:
         if not first and time.monotonic() - self._write_at > limits.step / limits.slew_rate:
             self.counters.overruns += 1
         if queue.turns != self._turns_published:
-            self._publish(True)  # the way bent where this move took over: one step may be all of it, and bend it again
+            self._publish(True)  # this move began at a turn, and another follows if it is a single step
         self._write(previous, shape)
         with self._change:
             ended = queue.step_written(move, self._applied)
@@ -278,8 +278,8 @@ class WriterThread:
             self._fault = reason
             self._queue.history_known = False
             self._rewrite_due = self._enabled
-            # No other move outlives the link, but the way to the safe shape was promised. That of `disable` is waited
-            # for and must end.
+            # A lost link ends all moves but the one to the safe shape, which was promised; that of `disable` is waited
+            # for, so it must end.
             newest = self._queue.newest
             to_safe = self._accepting and newest is not None and newest.kind is Kind.SAFE
             self._queue.end_all(Outcome.LINK_LOST, self._shape, newest if to_safe else None)

@@ -1,4 +1,4 @@
-"""What the actuators have crept to, kept on disk: the next start knows what was held before it, and for how long."""
+"""Creep state of the actuators, kept on disk: after a restart it is known what was held before, and for how long."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from dm_common.hysteresis.model import HysteresisModel, HysteresisState
     from dm_common.hysteresis.observer import HysteresisObserver
 
-#: Standard deviation of a shape that was held unseen, in shapes of the whole range: nearly all of them are within one.
+#: Standard deviation of a shape held unobserved, relative to one of the whole range: 2 sigma reach that.
 UNSEEN = 0.5
-#: Time constant, s, above which a calibration's run does not show an element, and by what share its weight may be off.
+#: Time constant, s, above which a calibration run does not determine creep elements; relative error of their weights.
 SLOW_S, SLOW_SHARE = 300.0, 0.35
 
 
@@ -31,10 +31,10 @@ class CreepRecord(NamedTuple):
     Attributes:
         time: s, of the clock that commands are stamped with.
         creep_time: (J,) s, of the elements.
-        crept: (N, J) effective signals that they have followed so far.
+        crept: (N, J) states of the elements: effective signals, low-pass filtered.
         crept_sigma: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
-        lagged: (N, L) signals that the first L of them have followed so far; where the law has more such elements,
-            and in records of older versions, it is taken to be as `crept`.
+        lagged: (N, L) states of the first L elements, as far as they follow the signals themselves; where the law has
+            more such elements, and in records of older versions, `crept` is used instead.
     """
 
     time: float
@@ -58,9 +58,9 @@ def write_record(file: Path, record: CreepRecord) -> None:
     """Replace `file` as a whole, also when the power fails meanwhile.
 
     Raises:
-        OSError: it cannot be written; the record that was there still is.
+        OSError: it cannot be written; the previous record is then unchanged.
     """
-    from dm_common.atomic_write import write_whole  # a start does not wait for it
+    from dm_common.atomic_write import write_whole  # not imported at start, to save time
 
     image = io.BytesIO()
     np.savez(image, **record._asdict())
@@ -71,10 +71,10 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
     """The record in `file`; None when there is none.
 
     Args:
-        now: s; 0 = not known, as before a simulator has told the time.
+        now: s; 0 = not known, for instance before a simulator has published the time.
 
     Raises:
-        ValueError: it cannot be used, with the reason; `now` is before it was written: the clock was set.
+        ValueError: the record cannot be used, with the reason; or `now` is before it was written (clock set).
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
@@ -82,7 +82,7 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
             values = [np.asarray(stored[name], dtype=np.float64) for name in names]
     except FileNotFoundError:
         return None
-    except Exception as error:  # where a file is damaged, NumPy fails in many ways
+    except Exception as error:  # NumPy raises many kinds of error for a damaged file
         raise ValueError(f"{file}: {error}: what was held before is not known") from error
     time, creep_time, crept, sigma, lagged = values
     whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == sigma.shape
@@ -97,10 +97,10 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
 def rested(
     law: HysteresisModel, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
 ) -> HysteresisState:
-    """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since it was known.
+    """The state at `time` (s) of a mirror at `signals` (N,), if it has stood there since it was last known.
 
-    That is since `record`, or since a calibration. Elements slower than that is ago hold what they held then; what was
-    held meanwhile is in doubt.
+    Last known is the time of `record`, or of the calibration. Creep elements with time constants longer than the time
+    since then still hold what they held; what was held meanwhile is uncertain.
     """
     moved = law.move(law.demagnetised(len(signals), time, middle), signals, time)
     settled = np.repeat(moved.position[:, None], len(law.creep_time), axis=1)
@@ -122,18 +122,18 @@ def rested(
 
 
 def held_unseen(law: HysteresisModel, sigma: Floats, elapsed: float) -> Floats:
-    """(J,) `crept_sigma` after `elapsed` s at a shape that nobody saw, of which `sigma` is what that left of it."""
+    """(J,) `crept_sigma` after `elapsed` s at an unobserved shape; `sigma` is what is left of the earlier one."""
     return np.hypot(sigma, UNSEEN * -np.expm1(-max(elapsed, 0.0) / law.creep_time))
 
 
 def slow_creep(law: HysteresisModel, elapsed: float) -> float:
-    """Standard deviation of an effective signal by creep that no run shows, `elapsed` s after a map showed it."""
+    """Standard deviation of an effective signal due to slow creep that no run determines, `elapsed` s after a map."""
     share = np.where(law.creep_time > SLOW_S, np.atleast_2d(law.creep_share).mean(axis=0), 0.0)
     return SLOW_SHARE * float(held_unseen(law, np.zeros(len(share)), elapsed) @ share)
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:
-    """What the actuators have crept to by `now` (s); None without an identified creep, or without a state."""
+    """The creep record at `now` (s); None without an identified creep, or without a state."""
     if state is None or not law.creep_rate:
         return None
     state = law.advance(state, now)
@@ -146,7 +146,7 @@ class CreepRecorder:
     Args:
         folder: of the records; empty = nothing is kept.
         observer: of the mirror.
-        warn: told, from any thread, what could not be done.
+        warn: called, from any thread, with a message on what failed.
 
     Attributes:
         folder: as above; may change.
@@ -155,10 +155,10 @@ class CreepRecorder:
     def __init__(self, folder: str, observer: HysteresisObserver, warn: Callable[[str], None]) -> None:
         self.folder, self._observer, self._warn = folder, observer, warn
         self._serial: str | None = None
-        self._disk = ThreadPoolExecutor(max_workers=1)  # until a disk has a record for sure may take long
+        self._disk = ThreadPoolExecutor(max_workers=1)  # fsync may take long
 
     def recall(self, serial: str, now: float) -> None:
-        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten."""
+        """Continue from the record of the mirror `serial`, if there is one; reports of another mirror are discarded."""
         if serial == self._serial:
             return
         another, self._serial = self._serial is not None, serial
@@ -170,9 +170,9 @@ class CreepRecorder:
         self._observer.recall(record, another)
 
     def keep(self, now: float) -> None:
-        """Have what the actuators have crept to by `now` (s) put on disk, if there is anything to keep.
+        """Write what the actuators have crept to by `now` (s) to disk, if there is anything to keep.
 
-        Without a link to the electronics the last record stands: nobody knows whether the outputs hold.
+        Without a link to the electronics the last record stays: it is not known whether the outputs hold.
         """
         latest = self._observer.latest
         if self._serial is None or latest is None or not latest.linked:

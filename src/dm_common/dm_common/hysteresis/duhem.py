@@ -1,15 +1,15 @@
 """Rate-independent hysteresis that fades with travel: Duhem operators, one with a learned slope and linear ones.
 
-``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. Play operators never forget what
-was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
-coefficients are fitted, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the law a mirror really has need not be one of them.
-Actuators may have polynomials of their own, and others on falling than on rising moves.
+``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. A play operator keeps its memory
+until a larger swing wipes it out; this operator forgets exponentially with travel, as some ceramics do. f is a
+polynomial with fitted coefficients, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the true law of a mirror need not be one.
+Each actuator may have its own polynomials, and different ones for rising and falling moves.
 
-The equation has no u in it, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
+u does not occur in f, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
 
-Linear ones follow powers of the signal, each at its own rate: ``dz = u^p du - rate z |du|``. Their weighted sums are
-laws of Coleman and Hodgdon [38] with any polynomials. They take up what no slope in z alone shows: domain walls that
-follow a curve of the signal [36].
+Linear operators follow powers of the signal, each at its own rate: ``dz = u^p du - rate z |du|``. Their weighted sums
+are Coleman-Hodgdon laws [38] with arbitrary polynomials. They represent what a slope that depends on z alone cannot:
+domain walls that follow a curve of the signal [36].
 """
 
 import numpy as np
@@ -20,9 +20,9 @@ from dm_common import Floats
 
 #: Largest |z| of a table.
 REACH = 2.5
-#: Longest straight way, from one end of the signals to the other.
+#: Longest straight move, from one end of the signal range to the other.
 FULL_SWING = 2.0
-#: Slope at which a table ends: z comes no nearer to its limit.
+#: Slope f(z) at which a table ends: z is then taken to have reached its limit.
 SLOPE_MIN = 1e-3
 KNOTS = 2001
 #: No operators.
@@ -33,10 +33,10 @@ class DuhemOperator:
     """The operator for any number of actuators at once.
 
     Args:
-        slope: (A,) coefficients a_1, a_2, ... of f, or (N, 2, A) of each actuator, on rising and on falling moves.
+        slope: (A,) coefficients a_1, a_2, ... of f, or (N, 2, A): for each actuator, for rising and for falling moves.
 
     Raises:
-        ValueError: coefficients that are not finite, or a state that no table holds.
+        ValueError: coefficients that are not finite, or a state that leaves the range of the table.
     """
 
     def __init__(self, slope: Floats) -> None:
@@ -53,14 +53,14 @@ class DuhemOperator:
         travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
         middle = KNOTS // 2
         travel -= travel[:, [middle]]
-        # A rise ends where the slope does, or where a full swing leads; a fall at the opposite value.
+        # A rise ends where f falls below SLOPE_MIN, or after a full swing; a fall ends at the opposite value.
         over = ((f < SLOPE_MIN) | (travel >= FULL_SWING))[:, middle + 1 :]
         end = middle + np.where(over.any(axis=1), over.argmax(axis=1), KNOTS)
         begin = KNOTS - 1 - (end.reshape(-1, 2)[:, ::-1].ravel() if self._own else end)
         met = (np.arange(KNOTS) >= begin[:, None]) & (np.arange(KNOTS) <= end[:, None])
         if end.max() >= KNOTS - 1 or end.min() < middle + 1 or f[met].min() <= 0.0:
             raise ValueError(f"duhem_slope = {slope.tolist()}: the state does not stay within +-{REACH:g}")
-        # All tables in one, each moved out of the others' way, so that one look-up serves all actuators.
+        # All tables in one, offset so that they do not overlap: one look-up then serves all actuators.
         self._apart = 2.0 * float(np.ptp(z))
         travel += 2.0 * np.abs(travel).max() * rows[:, None]
         self._end = travel[rows, end]
@@ -68,21 +68,21 @@ class DuhemOperator:
         self._z_apart = (z + self._apart * rows[:, None]).ravel()
 
     def _rows(self, way: Floats) -> NDArray[np.intp] | int:
-        """The table of each element of `way`: actuators are along the only axis, or the last but one."""
+        """Index of the table for each element of `way`; actuators are along the only axis, or the last but one."""
         if not self._own:
             return 0
         actuators = np.arange(len(self.slope))
         return np.asarray(2 * (actuators if way.ndim == 1 else actuators[:, None]) + (way < 0.0))
 
     def move(self, z: Floats, change: Floats) -> Floats:
-        """The state after signals changed by `change` (N,) or (..., N, P) from `z` on, which may repeat."""
+        """The state after signals changed by `change`, (N,) or (..., N, P), starting from `z`, which is broadcast."""
         way = np.where(change < 0.0, -1.0, 1.0)
         rows = self._rows(way)
         travelled = np.interp(way * z + self._apart * rows, self._z_apart, self._travel) + np.abs(change)
         return np.asarray(way * np.interp(np.minimum(travelled, self._end[rows]), self._travel, self._z))
 
     def rise(self, z: Floats, way: Floats) -> Floats:
-        """dz/du at the state z, on a way that rises (`way` 1) or falls (-1); shapes as in :meth:`move`."""
+        """dz/du at the state z on a rising (`way` 1) or falling (-1) move; shapes as in :meth:`move`."""
         along = way * z
         return horner(self._polynomial[:, self._rows(np.broadcast_to(way, along.shape))], along)
 
@@ -96,14 +96,14 @@ def horner(coefficients: Floats, x: Floats) -> Floats:
 
 
 class FadingHysteresis:
-    """What Duhem operators add to a law.
+    """Contribution of Duhem operators to a law.
 
-    States are (N, Z): of the operator with the learned slope, if there is one, then of the linear ones, rate by rate.
+    States are (N, Z): first the operator with the learned slope, if there is one, then the linear ones, rate by rate.
 
     Args:
-        slope, weight: of that operator, and () or (N,) of its value; an empty slope = none.
+        slope, weight: of the operator with the learned slope (empty = none), and () or (N,) weight of its value.
         rates: (K,) of the linear ones, positive.
-        drive: (K, P) or (N, K, P) weights of those that follow the powers 0 .. P - 1.
+        drive: (K, P) or (N, K, P) weights of the linear operators that follow the powers 0 .. P - 1 of the signal.
 
     Raises:
         ValueError: as :class:`DuhemOperator`.
@@ -115,14 +115,14 @@ class FadingHysteresis:
         self._learned = DuhemOperator(slope) if slope.size else None
         self._learned_weight = np.reshape(weight, (-1, 1))
         self._rates, self._drive = rates, drive if drive.ndim == 3 else drive[None]
-        # way a(u) + b(u), polynomials of the signal, solve the linear equations; what z is apart from that fades.
+        # way a(u) + b(u), polynomials of the signal, is a particular solution; the deviation of z from it decays.
         count, powers = drive.shape[-2:]
         self._solutions = np.zeros((2, count, powers, powers))
         for power in range(powers):
             self._solutions[0, :, power, power] = 1.0 / rates
             if power:
                 self._solutions[:, :, power] -= power / rates[:, None] * self._solutions[::-1, :, power - 1]
-        # The same of the weighted sums at each rate, and of those at all rates by rising power, with its slope.
+        # The same weighted by `drive` for each rate, then summed over rates by rising power, with the slope of the sum.
         self._sums = np.einsum("nkp,wkpq->wnkq", self._drive, self._solutions)
         self._curves = np.moveaxis(self._sums.sum(axis=2), 2, 1)[..., None]
         self._slopes = polyder(self._curves, axis=1) if powers else self._curves
@@ -133,11 +133,11 @@ class FadingHysteresis:
         return int(self._learned is not None) + self._drive[0].size
 
     def _linear(self, states: Floats) -> Floats:
-        """(N, K, P) of `states` (N, Z)."""
+        """The states (N, Z) of the linear operators as (N, K, P)."""
         return states[:, int(self._learned is not None) :].reshape(len(states), *self._drive.shape[1:])
 
     def move(self, states: Floats, signals: Floats, there: Floats) -> Floats:
-        """States (N, Z) after straight ways from `signals` (N,), where they are `states`, to `there` (N,)."""
+        """States (N, Z) after straight moves from `signals` (N,), where they are `states`, to `there` (N,)."""
         change = there - signals
         moved = [] if self._learned is None else [self._learned.move(states[:, 0], change)[:, None]]
         if self._rates.size:
@@ -150,15 +150,15 @@ class FadingHysteresis:
         return np.concatenate(moved, axis=1)
 
     def value(self, states: Floats) -> Floats:
-        """(N,) what actuators with the states (N, Z) add to static effective signals."""
+        """(N,) contribution of the states (N, Z) to the static effective signals."""
         linear = (self._drive * self._linear(states)).sum(axis=(1, 2))
         return linear if self._learned is None else linear + self._learned_weight[:, 0] * states[:, 0]
 
     def along(self, states: Floats, signals: Floats, there: Floats, way: Floats) -> tuple[Floats, Floats]:
-        """Value and slope at `there` (..., N, P) on straight ways from `signals` (N,), where they are `states` (N, Z).
+        """Value and slope at `there` (..., N, P) on straight moves from `signals` (N,), where they are `states` (N, Z).
 
         Args:
-            way: 1 where they rise, -1 where they fall; of a shape that broadcasts to that of `there`.
+            way: 1 for rising, -1 for falling moves; broadcasts to the shape of `there`.
         """
         change = there - signals[:, None]
         value = slope = np.zeros(())

@@ -1,13 +1,13 @@
-"""The inverse of the hysteresis model: the signals that bring about effective ones, from where the mirror stands.
+"""The inverse of the hysteresis model: the signals that produce given effective signals from the present state.
 
-On a straight way the play operators set in one after another, and between two of these places the law is a polynomial
-in the signal. Its value at all places tells the piece that holds the solution, Newton's method finds it there. The work
-grows with actuators times operators.
+On a straight move the play operators set in one after another, and between two of these onsets the law is a polynomial
+in the signal. The values of the law at all onsets identify the piece that holds the solution; Newton's method finds it
+there. The cost grows with actuators times operators.
 
-Where limits bind, they are those of the signals, and the shape is that of the effective signals. So the programme is
-solved for signals, with the model taken as straight about the last solution (sequential quadratic programming), or,
-where that led further away, on the way to it, until a round gains nothing. Changes weigh a little, which is gone where
-they end: else signals go far for what the surface hardly shows, such as piston. Each round ends inside the limits.
+Where limits bind, they bind the signals, while the shape depends on the effective signals. So the programme is solved
+for the signals with the law linearised about the last solution (sequential quadratic programming); after a round
+without gain, half its step and the slopes of its chord are tried. A small weight on changes, without effect at
+convergence, keeps signals from moving far for what the surface hardly shows, such as piston. All rounds stay legal.
 """
 
 from collections.abc import Iterator
@@ -23,22 +23,22 @@ from dm_common.hysteresis.duhem import horner
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
-#: Effective signals are met to this; a DAC step is three hundred times as large.
+#: Accuracy to which effective signals are met; a DAC step is three hundred times as large.
 TOLERANCE = 1e-7
 ROUNDS_MAX = 60
-#: Most rounds where a part follows the signals, known only then; what may be left of effective ones: 1/3 DAC step.
+#: Most iterations where elements follow the signals; effective signals may be off by LAG_LEFT then, 1/3 DAC step.
 LAG_ROUNDS, LAG_LEFT = 20, 1e-5
-#: Newton's step never divides by less; laws that can be inverted are steeper by far.
+#: Newton's step never divides by a slope below this; laws that can be inverted are steeper by far.
 SLOPE_MIN = 1e-3
-#: What neighbours stay below their limit: one step of a 16-bit DAC, since each of the two is rounded.
+#: Margin of neighbours below their limit: one step of a 16-bit DAC, since each of the two signals is rounded.
 DAC_STEP = 2.0**-15
-#: Rounds of the programme; the change of a signal, and the share of what is missed that is gained, at which it ends.
+#: Most rounds of the programme; it ends earlier at this change of signals, or below this share of the error gained.
 ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
-#: Weight of changes, as a share of what signals do at most; its factors after a round that gained nothing, and others.
+#: Weight of changes, relative to the largest gain of the matrix; its factors after a round without and with a gain.
 NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
-#: Half the step that the slope of the law is taken over.
+#: Half the signal step of the finite differences that give the slope of the law.
 SLOPE_STEP = 1e-4
-#: What no Duhem operators add.
+#: Contribution where there are no Duhem operators.
 NOTHING = np.zeros((1, 1))
 
 
@@ -48,7 +48,7 @@ class Inverted:
 
     Attributes:
         signals: (N,) inside the limits.
-        missed: (N,) wanted less reached effective signals: 0 but where a limit was met.
+        missed: (N,) wanted minus reached effective signals; non-zero only where a limit was met.
     """
 
     signals: Floats
@@ -60,7 +60,7 @@ def invert(
 ) -> Inverted:
     """Signals (N,) within `low` .. `high`, applied at the state's time, for `effective` (N,) `ahead` seconds later.
 
-    The law rises with the signal on every way, so each actuator has one solution.
+    The law increases with the signal on every straight move, so each actuator has one solution.
 
     Raises:
         ValueError: `effective` has another length than the mirror actuators, or is not finite.
@@ -77,24 +77,24 @@ def invert(
         inverted = pieces(law).solve(state, wanted, low, high)
         before, apart = apart, inverted.signals - wanted
         last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
-        if not LAG_LEFT < left < last:  # where it grows, further rounds would lead away
+        if not LAG_LEFT < left < last:  # a growing change means divergence
             break
     if not inverted.missed.any():
         return inverted
-    # A limit may lie before the place where the piece begins that the solution would need.
+    # A limit may lie before the onset of the piece that holds the solution, so the error is that of the law itself.
     missed = np.where(inverted.missed, wanted - law.position_at(state, inverted.signals), 0.0)
     return Inverted(inverted.signals, missed)
 
 
 class Pieces:
-    """The polynomials of one law on a rising and on a falling way.
+    """The polynomials of one law on rising and on falling moves.
 
     Attributes:
         radius: (R,) half-widths, rising.
         polynomial: (D + 1, 2, 1 or N, R) coefficients by rising power of the sum over the operators 0 .. k that have
-            set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
+            set in, on falling [0] and on rising [1] moves; common to all actuators, or for each.
         derivative: (D, 2, 1 or N, R) likewise, of its slope.
-        fading: what Duhem operators add; None = there are none.
+        fading: contribution of Duhem operators; None = there are none.
     """
 
     def __init__(self, law: HysteresisModel) -> None:
@@ -102,11 +102,11 @@ class Pieces:
         self._order = None if (np.diff(order) == 1).all() else order
         self.radius = law.play_radius[order]
         weight = np.moveaxis(law.play_weight.reshape(-1, *law.play_weight.shape[-2:])[:, order], 2, 0)
-        self._single = np.concatenate((np.zeros((1, *weight.shape[1:])), weight))  # of each alone, in its own value
+        self._single = np.concatenate((np.zeros((1, *weight.shape[1:])), weight))  # each alone, in its own value
         powers = len(self._single)
         self.polynomial = np.zeros((powers, 2, *weight.shape[1:]))
         for way, sign in enumerate((-1.0, 1.0)):
-            # What has set in follows the signal at the distance of its half-width: (s - sign r)^power.
+            # An operator that has set in follows the signal at its half-width: (s - sign r)^power.
             for power in range(powers):
                 for low in range(power + 1):
                     self.polynomial[low, way] += (
@@ -118,18 +118,18 @@ class Pieces:
         self.derivative = self.polynomial[1:] * self._powers[..., None, None]
 
     def added(self, state: HysteresisState, there: Floats, sign: Floats) -> tuple[Floats, Floats]:
-        """What Duhem operators add to value and slope of the law at `there`, see `FadingHysteresis.along`."""
+        """Contribution of Duhem operators to value and slope of the law at `there`, see `FadingHysteresis.along`."""
         if self.fading is None:
             return NOTHING, NOTHING
         return self.fading.along(state.fading, state.signals, there, sign)
 
     def onsets(self, state: HysteresisState, sign: Floats, polynomial: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Signals (..., N, R) at which operators set in, the law there, what Duhem operators add to its slope, and what
-        the operators that have not set in yet add to the law (N, R).
+        """Signals (..., N, R) at which operators set in, the law there, the contribution of Duhem operators to its
+        slope, and the contribution (N, R) to the law of the operators that have not set in yet.
 
         Args:
-            sign: 1 where the way rises, -1 where it falls.
-            polynomial: (D + 1, ..., N or 1, R) of these ways.
+            sign: 1 for rising, -1 for falling moves.
+            polynomial: (D + 1, ..., N or 1, R) of these moves.
         """
         play = state.play if self._order is None else state.play[:, self._order]
         value = horner(self._single, play)
@@ -142,7 +142,7 @@ class Pieces:
         """Signals for the static effective signals `wanted` (N,)."""
         rising = wanted >= state.position
         way, sign = rising.astype(np.intp), np.where(rising, 1.0, -1.0)
-        if len(self.radius) == 1 and self.radius[0] == 0.0:  # no play: one piece, which begins where the mirror stands
+        if len(self.radius) == 1 and self.radius[0] == 0.0:  # no play: one piece, which begins at the present signal
             start = np.minimum(np.maximum(state.signals + (wanted - state.position), low), high)
             near, far = np.where(rising, state.signals, low), np.where(rising, high, state.signals)
             polynomial, none = self.polynomial[:, 0, :, 0], np.zeros(1)
@@ -158,7 +158,7 @@ class Pieces:
         following = np.minimum(piece + 1, last)
         polynomial, fixed = self.polynomial[:, way, laws, piece], waiting[rows, piece]
         begin, end = onset[rows, piece], np.where(piece < last, onset[rows, following], np.where(rising, high, low))
-        # The chord of a narrow piece comes close; beyond the last place the slope is about 1.
+        # The chord of a narrow piece is a good start; beyond the last onset the slope is about 1.
         before, after = still[rows, piece], still[rows, following]
         chord = np.where(before > after, (end - begin) / np.where(before > after, before - after, 1.0), sign)
         near, far = np.minimum(begin, end), np.maximum(begin, end)
@@ -176,7 +176,7 @@ class Pieces:
         low: Floats,
         high: Floats,
     ) -> Inverted:
-        """The root between `low` and `high` (N,) of what rises there, or the end that comes nearest to it."""
+        """The root of the increasing law between `low` and `high` (N,), or the end that comes nearest to it."""
         derivative = polynomial[1:] * self._powers
         gap = wanted
         for _ in range(ROUNDS_MAX):
@@ -195,24 +195,24 @@ class Pieces:
         return Inverted(signals, np.where(np.abs(gap) <= 2.0 * TOLERANCE, 0.0, -gap))
 
 
-#: A law never changes, so what is worked out from it is kept.
+#: A law never changes, so what is derived from it is cached.
 pieces = lru_cache(maxsize=8)(Pieces)
 
 
 def within(limits: Limits) -> Limits:
-    """`limits` with room for the rounding of the electronics, where neighbours can differ by more than their limit."""
+    """`limits` with a margin for the rounding of the electronics, where the limit between neighbours can bind."""
     if not limits.neighbours_can_bind:
         return limits
     return replace(limits, neighbour_difference=max(limits.neighbour_difference - DAC_STEP, 0.5 * DAC_STEP))
 
 
 class ConstrainedInverse:
-    """Nearest legal commands on one mirror.
+    """Finds the nearest commands inside the limits of one mirror.
 
     Args:
         law: of its actuators.
         limits: of the signals.
-        matrix: (M, N) what a unit of each effective signal does, in the rows that are to be met.
+        matrix: (M, N) response per unit of each effective signal, in the rows that are to be met.
         ridge: weight of the squared effective signals, in the squared unit of `matrix`.
     """
 
@@ -246,7 +246,7 @@ class ConstrainedInverse:
 
         signals = np.clip(start, limits.low, limits.high)
         effective, slope = reached(signals), rise(signals)
-        least, near = np.inf, self._near  # where it begins need not be legal
+        least, near = np.inf, self._near  # the start may violate limits
         for _ in range(ROUNDS):
             programme = BoundedProgramme(np.vstack((self._root * slope, near)), limits)
             straight = wanted - self._root @ (effective - slope * signals)
@@ -257,7 +257,7 @@ class ConstrainedInverse:
                 signals, effective = found, there
                 slope = rise(signals)
             else:
-                # Actuators turn on the way, which changes their slopes: those of the whole way serve better.
+                # Actuators that turn within the step change their slopes: the chord of the whole step is more accurate.
                 np.divide(there - effective, step, out=slope, where=np.abs(step) > SLOPE_STEP)
                 half = signals + 0.5 * step
                 if missed(reached(half)) < least:
@@ -268,14 +268,14 @@ class ConstrainedInverse:
         return signals, effective
 
 
-#: Random histories that tell what is always within reach, their moves, and the time between those, s.
+#: Random histories from which the range that is always reachable is found, their moves, and the time between those, s.
 HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
 
 
 def random_histories(
     law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
 ) -> Iterator[HysteresisState]:
-    """States after random moves between `low` and `high`: of `histories` actuators, or of those of the law so often."""
+    """States after random moves between `low` and `high`, in total of at least `histories` actuators."""
     count = law.actuators or histories
     for _ in range(ceil(histories / count)):
         state = law.demagnetised(count, 0.0, 0.5 * (low + high))
@@ -285,9 +285,9 @@ def random_histories(
 
 
 def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
-    """Effective signals that signals of `low` .. `high` reach whatever was before: hysteresis and creep take some away.
+    """Range of effective signals that signals of `low` .. `high` reach whatever the history.
 
-    The least of what random histories leave at either end.
+    Hysteresis and creep narrow it; this is the narrowest range over random histories.
     """
     ends: dict[float, list[Floats]] = {low: [], high: []}
     for state in random_histories(law, low, high, np.random.default_rng(0)):

@@ -1,4 +1,4 @@
-"""What a law is over the whole range of the signals: how steep at least, how far it reaches, and its loops."""
+"""Properties of a law over the whole range of the signals: its smallest slope, its reach, and its loops."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,29 +13,29 @@ from dm_common.limits import Limits
 
 #: Points of a branch of a loop.
 STEPS = 81
-#: Signals at which slopes are looked at, and turns before them.
+#: Number of signals at which slopes are evaluated, and of turning points before them.
 PLACES = 41
 
 
 def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
-    """Smallest slope of the effective signal over signals of `low` .. `high`, on any way, of each law: (1,) or (N,).
+    """Smallest slope of the effective signal over signals of `low` .. `high`, on any move, of each law: (1,) or (N,).
 
-    After a turn the operators set in one by one, narrow ones first; those of half-width r have set in only where the
-    turn can lie 2 r behind.
+    After a turning point the operators set in one by one, narrow ones first. One of half-width r can only have set in
+    where the range leaves room for a turning point 2 r back.
     """
     parts = pieces(law)
     signals = np.linspace(low, high, PLACES)
-    behind = np.stack((high - signals, signals - low))[:, None, :, None]  # on a falling and on a rising way
-    slope = horner(parts.derivative[..., None, :], signals[:, None])  # of each number of operators that have set in
+    behind = np.stack((high - signals, signals - low))[:, None, :, None]  # on a falling and on a rising move
+    slope = horner(parts.derivative[..., None, :], signals[:, None])  # for each number of operators that have set in
     if parts.fading is not None:
         slope = slope + _fading_slope(parts.fading, law.actuators or 1, signals, parts.radius)
-    dead_zone = 0.0 if parts.radius[0] else np.inf  # before anything has set in, also without an end
+    dead_zone = 0.0 if parts.radius[0] else np.inf  # slope 0 until a first operator sets in, if any does
     return np.asarray(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min(axis=(0, 2, 3)))
 
 
 def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:
-    """(2, N, S, R) smallest slope of what fades at `signals` (S,), on falling and rising ways, at least 2 `radius` (R,)
-    after a turn that a full swing led to; infinite where no turn lies so far behind.
+    """(2, N, S, R) smallest slope of the Duhem part at `signals` (S,), on falling and rising moves, at least 2 `radius`
+    (R,) after a turn that a full swing led to; infinite where no turn lies so far back.
     """
     count, step = len(signals), signals[1] - signals[0]
     apart = np.minimum((2.0 * radius / step).astype(int), count - 1)
@@ -45,7 +45,7 @@ def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, rad
         states, at = np.zeros((actuators, fading.size)), np.full(actuators, met[0])
         for end in (met[-1], met[0], met[-1]):
             states, at = fading.move(states, at, np.full(actuators, end)), np.full(actuators, end)
-        slopes = np.full((count, count, actuators), np.inf)  # over steps since the turn, and signals
+        slopes = np.full((count, count, actuators), np.inf)  # indexed by steps since the turn, signal
         for turn in range(count):
             there = np.full(actuators, met[turn])
             onward = np.tile(met[turn:], (actuators, 1))
@@ -57,18 +57,18 @@ def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, rad
 
 
 def span(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
-    """Effective signal at `high` less that at `low` in a full cycle that closes, of each law: (1,) or (N,)."""
+    """Effective signal at `high` minus that at `low` in a closed full cycle, of each law: (1,) or (N,)."""
     lower = turned(law, (high, low, high, low), 0.5 * (low + high))
     return np.asarray(law.move(lower, np.full_like(lower.signals, high), 0.0).position - lower.position)
 
 
 def normalised(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> HysteresisModel:
-    """The same law with effective signals that span as much as signals of `low` .. `high`, in a full cycle."""
+    """The same law, scaled so that effective signals span as much as signals of `low` .. `high` in a full cycle."""
     return law.scaled((high - low) / span(law, low, high))
 
 
 def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
-    """Limits on effective signals that signals within `limits` reach whatever was before, see `certain_reach`."""
+    """Limits on effective signals that signals within `limits` reach whatever the history, see `certain_reach`."""
     if law.is_identity:
         return limits
     low, high = certain_reach(law, limits.low, limits.high)
@@ -77,9 +77,9 @@ def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
 
 
 def turned(law: HysteresisModel, turns: Sequence[float], middle: float = 0.0) -> HysteresisState:
-    """The state after a degauss that ended at `middle` and straight ways of all actuators to each of `turns`.
+    """The state after a degauss that ended at `middle` and straight moves of all actuators to each of `turns`.
 
-    Of as many actuators as have laws of their own, or of one.
+    It has as many actuators as have laws of their own, or one.
     """
     state = law.demagnetised(law.actuators or 1, 0.0, middle)
     for turn in turns:
@@ -90,7 +90,7 @@ def turned(law: HysteresisModel, turns: Sequence[float], middle: float = 0.0) ->
 def branch(
     law: HysteresisModel, state: HysteresisState, end: float, steps: int = STEPS
 ) -> tuple[Floats, Floats, HysteresisState]:
-    """Signals (S,), static effective signals (S, N) and the last state on a straight way of all actuators to `end`."""
+    """Signals (S,), static effective signals (S, N) and the last state on a straight move of all actuators to `end`."""
     signals = np.linspace(float(state.signals[0]), end, steps)
     positions = np.empty((steps, len(state.signals)))
     for step, signal in enumerate(signals):
@@ -112,5 +112,5 @@ def closed_cycle(
 
 
 def opening(rising: Floats, falling: Floats) -> Floats:
-    """(N,) largest distance of the branches (S, N) of a closed cycle, as a share of its span."""
+    """(N,) largest distance between the branches (S, N) of a closed cycle, as a share of its span."""
     return np.asarray(np.abs(falling - rising).max(axis=0) / (rising[-1] - rising[0]))

@@ -1,21 +1,21 @@
-"""The law by which actuators remember, and the state of a mirror under it.
+"""The law of hysteresis and creep of the actuators, and the state of a mirror under it.
 
 Every actuator follows an *effective signal*; sag and coefficients are linear in it, and the influence function holds
-the gains. Signals are normalised; over a slow full cycle of those of the run the effective signal spans what they do.
+the gains. Signals are normalised; over a slow full cycle of the run's range the effective signal spans what they span.
 
-* Hysteresis: a sum over play operators p_r of half-width r of polynomials in their values. With first powers it is the
-  Prandtl-Ishlinskii model ([16], section 2.4); higher powers make
-  it a Preisach operator whose density over centre and half-width of the relays is learned: the relays
-  of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
+* Hysteresis: a sum of polynomials in the values of play operators p_r of half-width r. With first powers only it is
+  the Prandtl-Ishlinskii model ([16], section 2.4). Higher powers make it a Preisach operator with a learned density
+  over centre and half-width of the relays: of the relays of half-width r, those centred below p_r are up (ibid.).
+  Half-width 0 is the signal itself: the loading curve.
 * Optionally Duhem operators (:mod:`~dm_common.hysteresis.duhem`), for hysteresis that fades.
-* Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
-  grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does. The first
-  of them follow the signal by a spectrum of its own: what its loops add may lag behind, or creep, otherwise than the
-  straight part does, so that loops are wider for fast moves. Creep may grow from one end of the range to the other.
+* Creep: first-order elements, evenly spaced over the logarithm of time, follow the static part. Together they grow by
+  `creep_rate` of a step per decade [17, 18]; a spectrum weights them individually. The first elements also follow the
+  signal, with a spectrum of their own: the loops may lag or creep differently from the straight part, so that they are
+  wider for fast moves. The size of creep may change linearly over the range.
 
-The weights are those of all actuators, or each actuator has its own.
+The weights are common to all actuators, or each actuator has its own.
 
-Nothing here depends on how a straight way is cut into steps, so only turning points have to be known.
+The result does not depend on how a straight move is divided into steps, so only turning points have to be known.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis, horner
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
-#: The most creep per decade of time that a law may have.
+#: Largest creep per decade of time that a law may have.
 CREEP_RATE_MAX = 0.2
-#: How much more a request may err than the held-out moves of the calibration, which follow each other within seconds:
-#: requests, which are held for longer, err 1.2 to 2.6 times as much.
+#: Assumed ratio of the errors of requests to those of the held-out moves of the calibration. These follow each other
+#: within seconds; requests are held for longer and err 1.2 to 2.6 times as much.
 IN_USE = 1.4
 
 
 @dataclass(frozen=True, eq=False)
 class HysteresisState:
-    """Where the actuators stand, with all they remember. Never changed in place.
+    """State of the actuators, including all they remember. Never changed in place.
 
     Attributes:
         time: s, of the clock that commands are stamped with.
@@ -47,9 +47,9 @@ class HysteresisState:
         play: (N, R) values of the play operators.
         fading: (N, Z) of the Duhem operators.
         position: (N,) static effective signal: hysteresis without creep.
-        crept: (N, J) what the creep elements have followed so far.
-        crept_sigma: (J,) its standard deviation, in shapes of the whole range: 0 but where some were held unseen.
-        lagged: (N, L) what the elements that follow the signals have followed of them.
+        crept: (N, J) states of the creep elements: static effective signals, low-pass filtered.
+        crept_sigma: (J,) its standard deviation, relative to a shape of the whole range; 0 if none was held unobserved.
+        lagged: (N, L) states of the elements that follow the signals: signals, low-pass filtered.
     """
 
     time: float
@@ -69,17 +69,17 @@ class HysteresisModel:
     Attributes:
         play_radius: (R,) half-widths, normalised; 0 = the signal itself.
         play_weight: (R, D) weights of the powers 1 .. D of each play operator's value, or (N, R, D) for each actuator.
-        duhem_slope: (A,) of the Duhem operator, or (N, 2, A) of each actuator, rising and falling; empty = none.
+        duhem_slope: (A,) of the Duhem operator, or (N, 2, A): for each actuator, rising and falling; empty = none.
         duhem_weight: () or (N,) of the Duhem operator's value.
-        fading_rate: (K,) per signal travelled, of the linear Duhem operators; empty = none.
-        fading_weight: (K, P) or (N, K, P) of those that follow the powers 0 .. P - 1 of the signal.
+        fading_rate: (K,) decay per unit of signal travelled, of the linear Duhem operators; empty = none.
+        fading_weight: (K, P) or (N, K, P) weights of those that follow the powers 0 .. P - 1 of the signal.
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
         creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
-        crept_at, crept: s, and (N,) effective signals that the actuators had crept to by then, just before the maps of
-            the calibration: its figure is relative to that. Empty = not told.
-        creep_covariance: (2, 1 + J, 1 + J) of the errors of the weights of `position` and of the creep elements: those
-            that all actuators share, and those of each by itself. Empty = not told.
+        crept_at, crept: time, s, and (N,) effective signals that the actuators had crept to by then, just before the
+            maps of the calibration: its figure is relative to that state. Empty = not known.
+        creep_covariance: (2, 1 + J, 1 + J) of the errors of the weights of `position` and of the creep elements: first
+            those common to all actuators, then those of each by itself. Empty = not known.
         lag_spectrum: (L,) or (N, L) weight of each of the first L elements in following the signal, relative to an even
             spectrum; empty = none.
         creep_slope: relative change of creep per unit of `position`.
@@ -136,7 +136,7 @@ class HysteresisModel:
 
     @classmethod
     def linear(cls, creep_rate: float = 0.0) -> HysteresisModel:
-        """No hysteresis: but for creep of so much per decade the effective signal is the signal."""
+        """No hysteresis: apart from creep of `creep_rate` per decade the effective signal is the signal."""
         return cls(np.zeros(1), np.ones((1, 1)), NONE, 0.0, creep_rate, CREEP_TIMES if creep_rate else NONE)
 
     @cached_property
@@ -156,7 +156,7 @@ class HysteresisModel:
 
     @cached_property
     def fading(self) -> FadingHysteresis | None:
-        """What Duhem operators add; None = there are none."""
+        """Contribution of Duhem operators; None = there are none."""
         if not (self.duhem_slope.size or self.fading_rate.size):
             return None
         return FadingHysteresis(self.duhem_slope, self.duhem_weight, self.fading_rate, self.fading_weight)
@@ -196,7 +196,7 @@ class HysteresisModel:
     # --- states ---
 
     def demagnetised(self, actuators: int, time: float, middle: float = 0.0) -> HysteresisState:
-        """The state after a degauss that ended at `middle`, long rested there."""
+        """The state after a degauss that ended at `middle`, with creep fully settled there."""
         play = np.full((actuators, len(self.play_radius)), middle)
         fading = np.zeros((actuators, self.fading.size if self.fading is not None else 0))
         none, crept = np.zeros(actuators), np.zeros((actuators, len(self.creep_time)))
@@ -207,7 +207,7 @@ class HysteresisModel:
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
 
     def degaussed(self, state: HysteresisState, time: float, middle: float = 0.0) -> HysteresisState:
-        """The state after a degauss that ended at `middle`; creep remembers what was before."""
+        """The state after a degauss that ended at `middle`; creep still remembers what was before."""
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
         return replace(fresh, crept=waited.crept, crept_sigma=waited.crept_sigma, lagged=waited.lagged)
@@ -227,7 +227,7 @@ class HysteresisModel:
         return replace(state, time=time, crept=crept, crept_sigma=state.crept_sigma * rest, lagged=lagged)
 
     def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
-        """Wait until `time` (s), then go to `signals` (N,) on a straight way."""
+        """Wait until `time` (s), then move straight to `signals` (N,)."""
         state = self.advance(state, time)
         play, fading = self._moved(state, signals)
         return replace(state, signals=signals, play=play, fading=fading, position=self._position(play, fading))
@@ -242,14 +242,14 @@ class HysteresisModel:
         return np.asarray((1.0 + self.creep_slope * state.position) * creep)
 
     def creep_ahead(self, state: HysteresisState, ahead: float) -> tuple[Floats, Floats, Floats]:
-        """Creep `ahead` s later of what is, and what shares of static effective signals and signals then add to it."""
+        """Remainder of present creep after `ahead` s, and the weights of static effective signals and signals then."""
         rest = np.exp(-ahead / self.creep_time)
         lag_rest = rest[: self.lag_spectrum.shape[-1]]
         faded = (self.creep_share * state.crept) @ rest + (self.lag_share * state.lagged) @ lag_rest
         return faded, self.creep_share @ (1.0 - rest), self.lag_share @ (1.0 - lag_rest)
 
     def static_of(self, effective: Floats, grown: Floats, faded: Floats) -> Floats:
-        """(N,) static effective signals p of which `effective` (N,) is p + (1 + creep_slope p) (grown p + faded)."""
+        """(N,) static effective signals p that solve `effective` (N,) = p + (1 + creep_slope p) (grown p + faded)."""
         slope, rest = self.creep_slope, effective - faded
         if not slope:
             return np.asarray(rest / (1.0 + grown))

@@ -1,7 +1,7 @@
-"""Where the actuators stand and what their hysteresis holds, followed through what the driver reports as applied.
+"""Follows the hysteresis state of the actuators through the signals that the driver reports as applied.
 
-Planning never changes it: reports do. So a command that was refused, lost, cut short or sent by somebody else leaves no
-wrong state behind.
+Only reports change the state, planning never does. So a command that was refused, lost, cut short or sent by another
+client leaves no wrong state behind.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ ESTIMATES_KEPT = 500
 class HysteresisTracker:
     """The hysteresis state of one mirror under one law, from reports in the order sent.
 
-    A move is straight between turns, and hysteresis depends on the turns only: reports may be lost as long as no two
-    turns happen between two that arrive. A degauss over the full range begins a new history.
+    Moves are straight between turning points, and hysteresis depends on these only: reports may be lost as long as at
+    most one turn happens between two that arrive. A degauss over the full range begins a new history.
 
     Attributes:
         law: the law that is followed.
         state: the best guess; None before the first report.
         unknown: the reason why the state is a guess only; "" = it is known.
-        last: report; one that only repeats it may take its place.
+        last: the last report; a later one that merely repeats it may replace it.
     """
 
     def __init__(self, law: HysteresisModel, middle: float = 0.0, record: CreepRecord | None = None) -> None:
@@ -42,7 +42,7 @@ class HysteresisTracker:
         self.unknown = "the driver has not reported yet"
         self.last: Applied | None = None
         self._set_off: HysteresisState | None = None  # the state when the move under way began
-        self._seen = -np.inf  # s, until when it is known what stood
+        self._seen = -np.inf  # s, time up to which the outputs are known
 
     def observe(self, report: Applied) -> None:
         """Take the next report.
@@ -58,34 +58,34 @@ class HysteresisTracker:
         if last is None or self.state is None:
             record, time = self._record, report.time
             if record is not None and time < record.time <= report.heard:
-                time = record.time  # made of this very shape, which was written before and still stands
+                time = record.time  # the record is of this same shape, which was written before and is still held
             self.state = rested(self.law, report.signals, time, self._middle, record)
             self.unknown = "it moved before this node followed it"
             return
         if last.linked:
             self._seen = max(last.heard, self.state.time)
         if last.time < self.law.crept_at <= report.time and self.law.crept.shape == report.signals.shape:
-            # The figure of a calibration is relative to what the actuators had crept to, as it found.
+            # The figure of a calibration is relative to the creep that it found: that replaces the creep followed here.
             state = self.law.advance(self.state, self.law.crept_at)
             crept = np.repeat(self.law.crept[:, None], len(self.law.creep_time), axis=1)
             self.state, self._set_off = replace(state, crept=crept, crept_sigma=0.0 * state.crept_sigma), None
         if report.time < last.time or max(report.time, report.heard) < self.state.time:
-            # Hysteresis knows no time; creep stands still until the clock has caught up.
+            # Hysteresis does not depend on time; creep pauses until the clock has caught up.
             self.state = replace(self.state, time=report.time)
         if report.turns < last.turns or report.degausses < last.degausses:
-            # As far as anybody knows it stood where the driver left it or came up, from when it was heard last.
+            # Best guess: since the driver was last heard, the mirror has stood at the signals that it reports now.
             self.state = self.law.move(self.state, report.signals, min(self._seen, report.time))
             self._guess_keeping_creep(report, "the driver was started or activated again", self._seen)
             return
         if report.degausses > last.degausses:
             self._degaussed(report, last)
             return
-        # Until its first write, whose stamp says when, a move has not begun: what stood goes on.
+        # A move begins with its first write, whose stamp gives the time; until then the earlier shape is held.
         unwritten = self._set_off is not None and np.array_equal(last.signals, self._set_off.signals)
         if report.moving and (not last.moving or report.turns > last.turns or unwritten):
             self._set_off = self.law.advance(self.state, report.time)
         if not report.history_known:
-            # Without a link, nobody knows whether the outputs held: the unit may have had no power.
+            # Without a link it is not known whether the outputs held: the unit may have lost power.
             since = self._seen if report.linked and not last.linked else report.time
             reason = "writes were lost, or a degauss was left, too short or too small"
             self._guess_keeping_creep(report, self.unknown or reason, since)
@@ -105,16 +105,16 @@ class HysteresisTracker:
     def _degaussed(self, report: Applied, last: Applied) -> None:
         """Begin a new history; moves since the degauss are known if there was at most one turn."""
         assert self.state is not None
-        # While it swings about the middle, creep follows the middle.
+        # During the swings about the middle, creep follows the middle.
         began, self._set_off = self._set_off or self.state, None
         self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
-        # The end of the degauss is a turn itself, and one left for it may precede.
+        # The end of the degauss counts as a turn, and so does a move that was abandoned for it.
         seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
         self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"
         self._follow(report, last)
 
     def _guess_keeping_creep(self, report: Applied, reason: str, since: float) -> None:
-        """Where the mirror stands is known, on which branch is not; what it stood at `since` then (s) is in doubt."""
+        """The position is known, but not the branch of the loop; what was held since `since` (s) is in doubt."""
         assert self.state is not None
         state = self.law.move(self.state, report.signals, report.time)
         sigma = held_unseen(self.law, state.crept_sigma, report.time - since)
@@ -140,7 +140,7 @@ class ActuatorEstimate(NamedTuple):
     def after_degauss(
         self, law: HysteresisModel, actuators: int, begun: float, time: float, middle: float
     ) -> ActuatorEstimate:
-        """After a degauss from `begun` to `time` (s), while which creep follows the middle; before may be unseen."""
+        """After a degauss from `begun` to `time` (s), while creep follows the middle; needs no earlier state."""
         state = self.state or rested(law, np.full(actuators, middle), begun, middle)
         return ActuatorEstimate(law.advance(law.degaussed(state, begun, middle), time), "")
 
@@ -156,7 +156,7 @@ class HysteresisObserver:
     """Follows one mirror under the law in use. May be asked from any thread.
 
     Attributes:
-        law: that is followed; without an identified hysteresis the linear one.
+        law: the law that is followed; the linear one where no hysteresis was identified.
         latest: the driver's last report; None before the first.
     """
 
@@ -166,13 +166,13 @@ class HysteresisObserver:
         self.latest: Applied | None = None
         self._middle, self._identified = 0.0, True
         self._record: CreepRecord | None = None
-        self._doubtful: deque[tuple[float, float]] = deque(maxlen=LOG_LENGTH)  # s, until when, and how long
+        self._doubtful: deque[tuple[float, float]] = deque(maxlen=LOG_LENGTH)  # time of the end, and duration, s
         self._tracker = HysteresisTracker(self.law)
         self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
         self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
 
     def use(self, law: HysteresisModel, middle: float, identified: bool = True) -> None:
-        """Follow another law, or one for want of any, through all reports so far; a degauss ends at `middle`."""
+        """Follow another law, a placeholder unless `identified`, through all reports; degausses end at `middle`."""
         with self._lock:
             self._identified = identified
             same = law.same_as(self.law) and middle == self._middle
@@ -181,7 +181,7 @@ class HysteresisObserver:
                 self.recall(self._record)
 
     def recall(self, record: CreepRecord | None, another: bool = False) -> None:
-        """Follow all reports so far anew, from what the actuators had crept to before; or none, of `another` mirror."""
+        """Follow all reports again, from the creep of `record`; of `another` mirror, forget the reports instead."""
         with self._lock:
             self._record = record
             if another:
@@ -196,20 +196,20 @@ class HysteresisObserver:
 
     def _widen(self, until: float, elapsed: float) -> None:
         state, law = self._tracker.state, self.law
-        if state is None or not until > law.crept_at:  # what a calibration found later is not in doubt
+        if state is None or not until > law.crept_at:  # creep that a calibration found later is known
             return
         state = law.advance(state, max(state.time, until))
         sigma = held_unseen(law, np.zeros(len(law.creep_time)), elapsed) * np.exp((until - state.time) / law.creep_time)
         self._tracker.state = replace(state, crept_sigma=np.hypot(state.crept_sigma, sigma))
 
     def observe(self, report: Applied, doubtful: float = 0.0) -> None:
-        """Take the driver's next report. One without signals, of a driver that knows none yet, is kept as the latest.
+        """Take the driver's next report; one without signals (the driver knows none yet) only becomes the latest.
 
         Args:
-            doubtful: s before it that may not have passed: what stood counts as held unseen for as long.
+            doubtful: s before it that the clock may have skipped: the shape counts as held unobserved for as long.
 
         Raises:
-            ValueError: another number of actuators, or numbers that are none; the observer begins anew.
+            ValueError: another number of actuators, or values that are not finite; the observer begins anew.
         """
         with self._lock:
             self.latest = report
@@ -223,7 +223,7 @@ class HysteresisObserver:
         if self._log and _same(self._log[-1], report):
             self._log[-1] = self._tracker.last = report
             return
-        # What a later law must know: where the way bent, and how a move under way began.
+        # A later law needs the turning points, and how a move under way began.
         if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
             self._log.pop()
         self._log.append(report)
@@ -261,7 +261,7 @@ class HysteresisObserver:
     def estimate(self, now: float, slew_rate: float = np.inf) -> ActuatorEstimate:
         """The actuators at `now` (s, of the clock that reports are stamped with).
 
-        A move under way is followed to where it should be by now: a new command makes it turn about there.
+        A move under way is extrapolated to where it should be by now: a new command makes it turn about there.
         """
         with self._lock:
             state, unknown, last = self._tracker.state, self._unknown(self.latest), self.latest
@@ -281,7 +281,7 @@ class HysteresisObserver:
 
 
 def _between(before: Applied, between: Applied, after: Applied) -> bool:
-    """Whether a law needs no report of `between`: the same move, or the same rest, goes on."""
+    """Whether a law needs no report of `between`, because it lies within one move or one rest."""
     if not _phase(before) == _phase(between) == _phase(after):
         return False
     return before.time <= between.time <= after.time and (between.moving or between.time == after.time)

@@ -87,19 +87,19 @@ def pitch_of_sphere(
 ) -> tuple[float, float]:
     """The lateral resolution (m per pixel) at which a map shows a sphere of known radius.
 
-    The defocus of a sphere goes with the square of the aperture, so heights give lengths.
+    The defocus of a sphere is proportional to the square of the aperture radius, so heights give lengths.
 
     Args:
         coefficients: (21,) m, of a map of the sphere.
         radius_px: of the aperture, pixels.
-        pitch: in use, m per pixel; 0 = not known.
+        pitch: lateral resolution in use, m per pixel; 0 = not known.
         radius_of_curvature: m; positive = concave.
 
     Returns:
-        The resolution, and its relative error for each nm of error in the defocus.
+        The resolution, and its relative error per nm of error in the defocus.
 
     Raises:
-        ValueError: no sphere, or the map shows nothing like it: further off than ten per cent from the pitch in use.
+        ValueError: no sphere, defocus of the other sign, or more than ten per cent off the pitch in use.
     """
     seen = float(np.asarray(coefficients)[DEFOCUS])
     if radius_of_curvature == 0.0 or not seen * radius_of_curvature > 0.0:
@@ -117,13 +117,13 @@ def pitch_of_sphere(
 
 
 def reachable_range(reached: Callable[[float], bool], middle: float, stroke: float, step: float) -> tuple[float, float]:
-    """Smallest and largest curvature (1/m) that a mirror reaches; (nan, nan) = neither 0 nor that in mid range.
+    """Smallest and largest curvature (1/m) that a mirror reaches; (nan, nan) if neither 0 nor `middle` is reached.
 
     Args:
-        reached: whether it reaches a curvature; by convexity there is one edge on either side of one that it does.
+        reached: whether it reaches a curvature; by convexity, those it reaches form one interval.
         middle: curvature in mid range: a mirror that is only pulled does not reach 0.
-        stroke: what all actuators together change it by at most.
-        step: to which the ends are found.
+        stroke: largest change of curvature by all actuators together, 1/m.
+        step: accuracy of the ends, 1/m.
     """
     start = next(filter(reached, (0.0, middle)), math.nan)
 
@@ -138,14 +138,14 @@ def reachable_range(reached: Callable[[float], bool], middle: float, stroke: flo
 
 
 def curvatures_text(low: float, high: float, digits: int = 4) -> str:
-    """A range of curvatures (1/m), and in brackets as optical power, see :func:`range_text`."""
+    """A range of curvatures (1/m), followed in brackets by the optical power, see :func:`range_text`."""
     return f"{range_text(low, high, '1/m', digits)} ({range_text(2 * low, 2 * high, 'dioptre', 3)})"
 
 
 def range_text(low: float, high: float, unit: str, digits: int = 4) -> str:
-    """What may be asked for, such as -0.0512 to +0.0499 1/m: rounded inwards, so that both ends may be too.
+    """A range of allowed values, such as -0.0512 to +0.0499 1/m: rounded inwards, so that both ends are allowed.
 
-    A range that is too narrow for so many `digits`, or has no ends, is given as it is.
+    A range that is too narrow for this many `digits`, or not finite, is only formatted.
     """
     if math.isfinite(low) and math.isfinite(high):
         scale = 10.0**digits

@@ -1,4 +1,4 @@
-"""Piston and tilt, which the interferometer's alignment adds: of maps, and of sag vectors at the sampling points."""
+"""Piston and tilt, which come from the interferometer's alignment: of maps, and of sag at the sampling points."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def fit_plane(sag: Floats) -> Floats:
 
     Returns:
         (piston at the map's centre, slope per column, slope per row), in the unit of the sag. A slope that the valid
-        pixels cannot tell (a single row or column) is 0.
+        pixels do not determine (a single row or column) is 0.
     """
     valid = np.isfinite(sag)
     if not valid.any():
@@ -59,7 +59,7 @@ def weighted_fit(sag: Floats, modes: Floats, weight: Floats) -> Floats:
     products = modes[:, :, None] * modes[:, None, :]
     gram = (shares @ products.reshape(modes.shape[0], -1)).reshape(len(sag), modes.shape[1], modes.shape[1])
     right = (shares * np.where(seen, sag, 0.0)) @ modes
-    # The pseudo-inverse serves maps with too few points as well; screening drops those.
+    # The pseudo-inverse also handles maps with too few points; screening drops those.
     return np.einsum("mij,mj->mi", np.linalg.pinv(gram, hermitian=True), right)
 
 
@@ -70,7 +70,7 @@ def remove_piston_tilt(sag: Floats, points: SamplePoints) -> Floats:
 
 
 def fill_gaps(sag: Floats, model: Floats, points: SamplePoints) -> Floats:
-    """Put `model` (M, P), fitted to each map in piston and tilt, where `sag` (M, P) is NaN; piston and tilt removed."""
+    """Fill NaN in `sag` (M, P) with `model` (M, P), fitted to each map in piston and tilt; remove piston and tilt."""
     plane = np.column_stack((np.ones_like(points.x), points.x, points.y))
     departure = sag - model
     shifted = model + weighted_fit(departure, plane, points.weight) @ plane.T

@@ -1,9 +1,9 @@
 """Concentric regions on sampling points instead of pixels, for stored maps that hold the sag at some hundred points.
 
-A point stands for a share of the aperture's area (its weight), not for a place without extent. With some ten rings of
+A point represents a share of the aperture's area (its weight), not a place without extent. With some ten rings of
 points and ten regions, counting a whole ring in or out would put the boundary of a region off by half a ring's width,
 up to 7 % of the area. So the boundary cuts through the points' shares. Points are taken from the centre outwards; those
-of one radius together stand for the annulus between the area of all points inside them and that area plus their own. A
+of one radius together represent the annulus between the area of all points inside them and that area plus their own. A
 disc of a given area holds of each point the part of that annulus that lies inside. For rings of edge-clustered points
 this is exact, as it is for uniform points, whose weights are equal.
 """
@@ -19,7 +19,7 @@ from dm_common.optics.sampling import SamplePoints
 
 #: Shares of the aperture's area, 10 % to 100 % (Fig. 4 in [1]).
 AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
-#: Squared radii that agree to so many decimals are one ring of points.
+#: Squared radii that agree to this many decimals belong to one ring of points.
 _RADIUS_DECIMALS = 9
 
 
@@ -56,7 +56,7 @@ def disc_shares(points: SamplePoints) -> Floats:
     area = np.bincount(ring.ravel(), weight)
     outer = np.cumsum(area)
     inner = outer - area
-    # The last ring ends at 1 but for rounding, and the whole aperture must hold it whole.
+    # The last ring must end at 1 without rounding error, so that the whole aperture contains it completely.
     outer[-1] = 1.0
     inside = (np.array(AREA_FRACTIONS) - inner[:, np.newaxis]) / (outer - inner)[:, np.newaxis]
     return np.asarray(np.clip(inside, 0.0, 1.0)[ring.ravel()])
@@ -68,7 +68,7 @@ def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) 
     Piston and tilt are removed once over the whole aperture, by the caller.
 
     Args:
-        sag: (M, P) at the points, NaN = no data; the points that are left then share the region.
+        sag: (M, P) at the points, NaN = no data; the points with data then represent the region.
         labels: (M,) names of the maps for messages.
 
     Returns:
@@ -94,7 +94,7 @@ def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) 
 def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
     """(P,) weight of each point: that of the ring it lies in.
 
-    Where the boundary of a region cuts through a point's area the squares are averaged, since weights act squared.
+    Where the boundary of a region cuts through a point's area, squared weights are averaged, since weights act squared.
 
     Args:
         weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
@@ -112,10 +112,10 @@ def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
 
 
 def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
-    """Place (b): factor of each row of the command solve min |W(dC - G dS)| on the vector of sag points.
+    """Place (b) of `dm_calibration.influence.weights`: row factors of the command solve min |W(dC - G dS)|.
 
-    Multiply the rows of the influence function (P, N) and of the wanted sag (P,) by it. It holds the points' areas too,
-    and its squares sum to 1 as those do: a ridge then weighs as much as without region weights.
+    On the vector of sag points, multiply the rows of the influence function (P, N) and of the wanted sag (P,) by them.
+    They include the points' areas; their squares sum to 1 as the areas do: a ridge weighs as without weights.
 
     Args:
         weights: (R,) of the regions.

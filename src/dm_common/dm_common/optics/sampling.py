@@ -41,7 +41,7 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
     """
     if count < 8:
         raise ValueError(f"count = {count}: must be at least 8")
-    rings = round(math.sqrt(count) / 2)  # makes the mean radial spacing that along the rings
+    rings = round(math.sqrt(count) / 2)  # equal mean spacing radially and along the rings
     radius = np.sin(np.pi / 2 * (np.arange(rings) + 0.5) / rings)
     edges = np.sin(np.pi / 2 * np.arange(rings + 1) / rings)
     wanted = count * radius / radius.sum()
@@ -90,6 +90,6 @@ def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: f
 
 
 def _snapped(position: Floats) -> Floats:
-    """Positions in pixels, those that coincide with a pixel row or column made exactly so."""
+    """Positions in pixels; those that coincide with a pixel row or column are put exactly there."""
     nearest = np.rint(position)
     return np.where(np.abs(position - nearest) <= _COINCIDENT, nearest, position)

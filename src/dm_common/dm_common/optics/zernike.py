@@ -1,8 +1,8 @@
-"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and from the orders of Noll, OSA/ANSI and Fringe.
+"""The 21 Zernike terms to order 5 in Born & Wolf's convention, and conversion from Noll's, OSA/ANSI's and Fringe's.
 
-Born & Wolf ([2], section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
-is that of [1]: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
-have the unit of the sag they describe (m).
+Born & Wolf ([2], section 9.2.1): peak-normalised, the maximum of every term on the unit disc is 1. The order is that of
+[1]: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients have the
+unit of the sag they describe (m).
 """
 
 import math
@@ -15,9 +15,9 @@ from dm_common import Floats
 
 MAX_ORDER = 5
 
-#: Number of the first terms that no interferometer can attribute to the mirror: piston and the two tilts.
+#: Number of leading terms that no interferometer can attribute to the mirror: piston and the two tilts.
 PISTON_TILT = 3
-#: Even powers of an actuator's distance from the centre, from 0 on, that describe the tilt that it makes.
+#: Number of even powers (from 0 on) of an actuator's distance from the centre that describe the tilt it makes.
 TILT_ORDERS = 3
 
 
@@ -63,7 +63,7 @@ class Term(NamedTuple):
     @property
     def noll_index(self) -> int:
         """Noll's index j = 1, 2, 3, ... [3]: cosine terms are even, sine terms odd."""
-        first = self.n * (self.n + 1) // 2 + self.m  # of the pair; the only one for m = 0
+        first = self.n * (self.n + 1) // 2 + self.m  # for m > 0 the lower index of the pair
         if self.m == 0:
             return first + 1
         return first + (first % 2 != (0 if self.kind == "cos" else 1))
@@ -76,7 +76,7 @@ class Term(NamedTuple):
 
     @property
     def fringe_index(self) -> int:
-        """Fringe (University of Arizona) index j = 1, 2, 3, ...: by n + m, of those with the same sum by falling m."""
+        """Fringe (University of Arizona) index j = 1, 2, 3, ...: sorted by n + m, then by falling m."""
         return ((self.n + self.m) // 2 + 1) ** 2 - 2 * self.m + (self.kind == "sin")
 
 
@@ -137,13 +137,13 @@ def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
     """Rms sag over the aperture without piston and tilt, m, of coefficients (21,), m.
 
     Args:
-        residual: rms of what the terms leave, m.
+        residual: rms of what the terms do not describe, m.
     """
     return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
 
 
 def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = False) -> Floats:
-    """As an array, with `count` terms on the last axis, or `more`."""
+    """Coefficients as an array, with `count` terms on the last axis, or at least as many if `more`."""
     values = np.asarray(coefficients, dtype=float)
     if values.ndim < 1 or not (values.shape[-1] == count or (more and values.shape[-1] > count)):
         least = "at least " if more else ""
@@ -153,7 +153,7 @@ def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = Fals
 
 #: Order and normalisation of coefficients here, by its name in dm_msgs/ZernikeCoefficients.
 BORN_WOLF = "born_wolf"
-#: By its name: where the order of a convention has each term, and the rms of the term where it is normalised by that.
+#: By name: index of each term in the convention's order, and the rms of the term where it is rms-normalised (else 1).
 CONVENTIONS: dict[str, tuple[NDArray[np.intp], Floats | float]] = {
     BORN_WOLF: (np.arange(len(TERMS)), 1.0),
     "noll": (np.array([term.noll_index - 1 for term in TERMS]), TERM_RMS),
@@ -163,7 +163,7 @@ CONVENTIONS: dict[str, tuple[NDArray[np.intp], Floats | float]] = {
 
 
 def to_born_wolf(coefficients: ArrayLike, convention: str) -> Floats:
-    """Coefficients in one of the CONVENTIONS to (..., 21) in Born & Wolf's; terms beyond order 5 are left out.
+    """Convert coefficients in one of the CONVENTIONS to (..., 21) of Born & Wolf's; terms beyond order 5 are dropped.
 
     Args:
         coefficients: (..., 21) of Born & Wolf's; (..., 21) or more of Noll's from index 1 on, or of OSA/ANSI's from
@@ -174,17 +174,17 @@ def to_born_wolf(coefficients: ArrayLike, convention: str) -> Floats:
 
 
 def tilt_influence(measured: Floats, places: Floats, response: Floats) -> Floats:
-    """The tilt that each actuator makes, (2, N) m per unit signal, from maps that show it under the instrument's own.
+    """The tilt that each actuator makes, (2, N) m per unit signal, from maps that include the instrument's own tilt.
 
-    The instrument stands otherwise in each map: 0.3 um at the edge leave 0.12 um per unit signal in what 159 maps say.
-    Far better known are the places of the actuators and how strongly each responds. An actuator tilts the plate towards
-    itself, by a smooth function of its distance from the centre times its response, and the few numbers of this
-    function are fitted to the tilts in all maps. A sphere needs them only where its command is not symmetric.
+    The instrument is aligned differently in each map: 0.3 um at the edge leave an error of 0.12 um per unit signal from
+    159 maps. The positions of the actuators and their responses are known far better. An actuator tilts the plate
+    towards itself, by a smooth function of its distance from the centre times its response. The few coefficients of
+    this function are fitted to the tilts in all maps. A sphere needs them only where its command is not symmetric.
 
     Args:
-        measured: (2, N) m per unit signal, as the maps say.
+        measured: (2, N) m per unit signal, as found from the maps.
         places: (2, N) x and y of the actuators, in aperture radii.
-        response: (N,) m rms that each makes per unit signal, piston and tilt removed.
+        response: (N,) m rms per unit signal of each actuator, piston and tilt removed.
     """
     lever = places * response
     square = np.square(places).sum(axis=0)

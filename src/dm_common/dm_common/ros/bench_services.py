@@ -29,11 +29,11 @@ from dm_common.ros.worker import sleep
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
 
-#: Failures of a measurement that another try does not mend.
+#: Failures of a measurement that another try cannot cure.
 _FATAL = (ErrorCode.INTERFEROMETER_INACTIVE, ErrorCode.NOT_SUPPORTED, ErrorCode.INVALID_ARGUMENT)
 #: Signals that differ less are the same command.
 _SAME_SIGNAL = 1e-6
-#: Tries of one map with an interferometer that is lost in each and comes back.
+#: Tries of one map, if the interferometer is lost in each and comes back.
 _TRIES = 5
 #: Wall time for a state message to confirm that the mirror still holds the command, s (it comes every 0.5 s).
 _STATE_WAIT_S = 2.0
@@ -44,16 +44,16 @@ _EXIT_WAIT_S = 5.0
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
-    All methods block and belong into a worker thread.
+    All methods block and must be called from a worker thread.
 
     Attributes:
-        hold: of the mirror.
-        nodes: whether those of driver and interferometer are there.
+        hold: the hold on the mirror.
+        nodes: liveliness of driver and interferometer.
         state: the driver's last state message; None before the first.
         settle_time: s of ROS time between command and map.
-        cancelled: asked while waiting.
+        cancelled: whether to cancel; called while waiting.
         map_time: s of ROS time that the last map took; 0 = none was taken yet.
-        waiting: called with what is waited for, a node that is missing for example; "" = it goes on.
+        waiting: called with what is waited for, such as a missing node; "" = the wait is over.
         temperature: of the mirror (degC) at a time (s of ROS time); NaN = not known.
     """
 
@@ -83,7 +83,7 @@ class BenchServices:
         self._driver.heard()
 
     def publish_waits(self, handle: Any, feedback: Any) -> None:
-        """Publish what is waited for from now on as the `message` of the feedback of a goal."""
+        """From now on, publish what is waited for as the `message` of the feedback of a goal."""
 
         def publish(text: str) -> None:
             feedback.message = text
@@ -97,9 +97,9 @@ class BenchServices:
         """Hold the mirror for the block: commands of others are refused.
 
         Args:
-            asked: the goal or request to do so, of which `holder` and `take_over` count, see `MirrorHolder.held`.
-            purpose: what for and how to end it, for those who are refused meanwhile.
-            duration: s that it will last, about; 0 = not known.
+            asked: the goal or request to do so; its `holder` and `take_over` are used, see `MirrorHolder.held`.
+            purpose: what it is for and how to end it, for clients that are refused meanwhile.
+            duration: expected duration, s; 0 = not known.
 
         Raises:
             Refusal: somebody else holds it, or there is no driver.
@@ -116,10 +116,10 @@ class BenchServices:
             raise Refusal(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
 
     def check_history(self) -> None:
-        """Raise Refusal when the driver knew what the actuators went through and no longer does.
+        """Raise Refusal when the driver knew the history of the actuators and no longer does.
 
-        A driver that was restarted, or lost its link, takes commands again soon; what was measured before and after
-        does not belong together without a degauss between.
+        A driver that was restarted, or lost its link, soon takes commands again; but what was measured before and after
+        does not belong together without a degauss in between.
         """
         was_known = self._history_known
         self._history_known = self.state is not None and self.state.history_known
@@ -130,7 +130,7 @@ class BenchServices:
             )
 
     def degauss(self, steps: int = 0) -> None:
-        """As of a bench, of so many half-swings; 0 = as configured in the driver."""
+        """As in `Bench`, with this number of half-swings; 0 = as configured in the driver."""
         goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
         timeout = self._values["degauss_timeout"]
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
@@ -145,7 +145,7 @@ class BenchServices:
     def apply(self, signals: Floats) -> Floats:
         request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder)
         with self._answered("set_signals", self._driver, self._set_signals.service_is_ready) as stop:
-            # A driver that was just started again may not have discovered this client yet: what it is sent is lost.
+            # A driver that was just restarted may not have discovered this client yet; its answer is then lost.
             again = qos.RETURN_S if self._driver.changed_within(qos.APPEAR_S) else math.inf
             response = call(self._set_signals, request, self._values["driver_timeout"], stop, again, self.hold.command)
         self._check("set_signals", response)
@@ -169,14 +169,14 @@ class BenchServices:
         raise Refusal(failure.error_code, f"{failure} ({_TRIES} tries)") from failure
 
     def measure_as_it_stands(self, label: str) -> Measurement:
-        """One map of whatever stands there; does not wait for an interferometer to return. Raises as `measure`."""
+        """One map of the shape as it stands; does not wait for an interferometer to return. Raises as `measure`."""
         return self._measured(label, lambda: None)
 
     def _no_interferometer(self) -> bool:
         return self._interferometer.missing(self._measure.service_is_ready)
 
     def _interferometer_returns(self) -> bool:
-        """Wait for an interferometer that has died, as long as for a map; whether it is back. Raises Cancelled."""
+        """Wait up to the timeout of a map for an interferometer that has died; whether it is back. Raises Cancelled."""
         deadline = time.monotonic() + self._values["measure_timeout"]
         while (missing := self._no_interferometer()) and time.monotonic() < deadline:
             if self._stopping():
@@ -188,7 +188,7 @@ class BenchServices:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
         began = self._node.get_clock().now()
-        # The interferometer keeps the time itself; the call waits a little longer for its answer, which says why.
+        # The interferometer keeps the time limit; the call waits a little longer for its answer, which has the reason.
         try:
             with self._answered("measure", self._interferometer, self._measure.service_is_ready) as stop:
                 response = call(self._measure, request, timeout + 5.0, stop)
@@ -200,7 +200,7 @@ class BenchServices:
         self.map_time = (self._node.get_clock().now() - began).nanoseconds * 1e-9
         check()
         try:
-            # The state was read after the map, so its stamp is of the write that the map shows.
+            # The state was read after the map, so its stamp is that of the write that the map shows.
             moved_ns = stamp_ns(self.state.header.stamp) if self.state is not None else 0
             measured = measurement_from(response)
             return replace(measured, moved_ns=moved_ns, temperature=self.temperature(1e-9 * measured.stamp_ns))
@@ -208,7 +208,7 @@ class BenchServices:
             raise Refusal(ErrorCode.INTERNAL, f"measure: {error}") from error
 
     def rest(self, signals: Floats) -> str:
-        """Ramp back to `signals`, whatever was cancelled. Returns what became of it, a sentence."""
+        """Ramp back to `signals`, even after a cancel. Returns the outcome as a sentence."""
         self.cancelled = lambda: False
         self._history_known = False
         deadline = time.monotonic() + self._values["degauss_timeout"]
@@ -219,13 +219,13 @@ class BenchServices:
             except Refusal as error:
                 if self.hold.lost is not None:
                     return f"the mirror is left as it is: {self.hold.lost}"
-                # A degauss or ramp that was cancelled here may still be running there.
+                # A degauss or ramp that was cancelled here may still be running in the driver.
                 if error.error_code not in (ErrorCode.BUSY, ErrorCode.PREEMPTED) or time.monotonic() > deadline:
                     return f"the mirror could NOT be brought back to mid range: {error}"
                 time.sleep(0.2)
 
     def rest_at_exit(self, signals: Floats) -> str:
-        """The same when the process ends, over a ROS context of its own: nobody serves the node any more."""
+        """As `rest`, when the process ends: over a ROS context of its own, since nobody serves the node any more."""
         self.hold.end()
         context = Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -247,7 +247,7 @@ class BenchServices:
             context.try_shutdown()
 
     def _missing(self) -> str:
-        """What of the bench is missing now, as a sentence; "" = nothing."""
+        """What is missing on the bench now, as a sentence; "" = nothing."""
         if self._driver.missing(self._set_signals.service_is_ready):
             return self._driver.text
         if self.state is not None and self.state.driver_state == ActuatorState.STATE_LINK_LOST:
@@ -255,7 +255,7 @@ class BenchServices:
         return self._interferometer.text if self._no_interferometer() else ""
 
     def _stopping(self) -> bool:
-        """Whether a wait is to end. What is missing meanwhile, needed or not yet, is said at once."""
+        """Whether a wait is to end. Anything missing meanwhile, needed now or later, is reported at once."""
         if (missing := self._missing()) != self._said:
             self._said = missing
             self.waiting(f"waiting: {missing}" if missing else "")
@@ -263,11 +263,11 @@ class BenchServices:
 
     @contextmanager
     def _answered(self, what: str, server: qos.Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
-        """Give a call a condition to end its wait by, and its failure a code and a sentence.
+        """Give a call a condition that ends its wait, and turn its failure into a code and a sentence.
 
         Args:
-            what: is called.
-            server: of the node that serves it.
+            what: name of what is called.
+            server: liveliness of the node that serves it.
             ready: whether it is served.
         """
         server.wait_for_return(self._stopping)
@@ -288,7 +288,7 @@ class BenchServices:
             raise Refusal(response.error_code, f"{what}: {response.message}")
 
     def _check_undisturbed(self) -> None:
-        """Raise Refusal when the mirror no longer holds what this node commanded: the map shows something else."""
+        """Raise Refusal when the mirror no longer holds what this node commanded: the map then shows another shape."""
         deadline = time.monotonic() + _STATE_WAIT_S
         while self.state is not None and self._commanded is not None:
             requested = np.array(self.state.requested, dtype=np.float64)

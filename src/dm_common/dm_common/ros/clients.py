@@ -1,4 +1,4 @@
-"""Clients for threads that may wait, as executor callbacks may not: of services, of actions, one to hold the mirror."""
+"""Clients for worker threads, which may wait (executor callbacks may not): services, actions, hold of the mirror."""
 
 import math
 import threading
@@ -17,7 +17,7 @@ from dm_common.errors import Cancelled, ErrorCode, Refusal
 
 #: How often a hold is renewed, s: several times within the driver's lease of 3 s.
 RENEW_S = 0.7
-#: Longest wait for the driver to take a hold back, s; else it ends with its lease.
+#: Longest wait for the driver to release a hold, s; otherwise the hold ends with its lease.
 RELEASE_S = 1.0
 #: Longest wait for the end of a goal that was cancelled, s.
 CANCEL_S = 20.0
@@ -27,7 +27,7 @@ class ServiceCallError(Exception):
     """A service or action did not answer: not there, too slow, or the wait was cancelled.
 
     Attributes:
-        error_code: of those who ask for others; TIMEOUT unless the reason is another.
+        error_code: for callers that serve others; TIMEOUT unless there is another reason.
     """
 
     def __init__(self, message: str, error_code: int = ErrorCode.TIMEOUT) -> None:
@@ -50,9 +50,9 @@ def call(
         client, request: the service, and what to send.
         timeout_s: longest wait for the server, and for its answer.
         cancelled: ends the wait.
-        again_s: without an answer the request is sent again after so long, once; for one that may be carried out twice.
-        send_by: called with what sends the request, and returns what that does.
-        ready_s: longest wait for the server, where that is less.
+        again_s: an unanswered request is sent again after this time, once; only for one that may be carried out twice.
+        send_by: called with a function that sends the request; returns what that function returns.
+        ready_s: longest wait for the server, if shorter than `timeout_s`.
 
     Raises:
         ServiceCallError: no server or no answer in time, `cancelled()` became true, or the process ends.
@@ -78,7 +78,7 @@ def call(
 
     future, again = send(), time.monotonic() + again_s
     while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
-        ended = cancelled() or not client.context.ok()  # nobody takes an answer once the process ends
+        ended = cancelled() or not client.context.ok()  # no answer arrives once the process ends
         if ended or time.monotonic() > deadline:
             client.remove_pending_request(future)
             reason = "cancelled" if ended else f"no answer within {timeout_s:g} s"
@@ -90,10 +90,10 @@ def call(
 
 
 class ThreadedActionClient(ActionClient):
-    """`rclpy.action.ActionClient` whose requests and answers exclude each other.
+    """`rclpy.action.ActionClient` in which sending a request and taking an answer exclude each other.
 
-    rclpy sends a request first and notes its number afterwards. An answer that the executor takes in between is thrown
-    away ("Ignoring unexpected goal response"), and the caller waits for ever.
+    rclpy sends a request first and records its number afterwards. An answer that the executor takes in between is
+    discarded ("Ignoring unexpected goal response"), and the caller waits for ever.
     """
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
@@ -129,17 +129,17 @@ def run_goal(
     identity: Any = None,
     send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
-    """Run a goal from a worker thread and return its result; one given up is cancelled first, and Ctrl-C says its end.
+    """Run a goal from a worker thread and return its result; if given up, cancel it first (Ctrl-C reports its end).
 
     Args:
         client, goal: the action, and what to send.
         timeout_s: longest wait for the end.
-        answer_s: longest wait for the server, and for an answer of it; None = `timeout_s`.
+        answer_s: longest wait for the server, and for its answer to the goal; None = `timeout_s`.
         on_feedback: called by the executor.
-        stop: cancels the goal; its result is waited for and returned all the same.
-        gone: whether the server is known to be gone; then nobody waits for it.
+        stop: cancels the goal; its result is still waited for and returned.
+        gone: whether the server is known to be gone; it is then not waited for.
         identity: of the goal, a unique_identifier_msgs/UUID; None = any.
-        send_by: called with what sends the goal, and returns what that does.
+        send_by: called with a function that sends the goal; returns what that function returns.
 
     Raises:
         ServiceCallError: no server, no answer or no end in time, or `stop()` before it began.
@@ -182,18 +182,18 @@ def run_goal(
 
 
 class MirrorHolder:
-    """One hold at a time, taken and given back by a worker thread, renewed by the executor.
+    """Holds the mirror: one hold at a time, taken and released by a worker thread, renewed by the executor.
 
-    A driver that was restarted gets the renewal too, so that the hold outlives it.
+    A restarted driver receives the renewal too, so that the hold survives the restart.
 
     Args:
         node: hosts the client.
-        name: of who holds the mirror.
-        gone: whether the driver is known to be gone; then nobody waits for it to take a hold back.
+        name: of the holder.
+        gone: whether the driver is known to be gone; the release of a hold is then not waited for.
 
     Attributes:
-        holder: who holds it; goes with every command as well.
-        lost: the refusal once somebody else took the mirror over; None = nobody did.
+        holder: name of the holder, sent with every command as well.
+        lost: the refusal, once somebody else has taken the mirror over; None before.
     """
 
     def __init__(self, node: Node, name: str, gone: Callable[[], bool] = lambda: False) -> None:
@@ -203,7 +203,7 @@ class MirrorHolder:
         self._client = node.create_client(HoldMirror, "hold_mirror")
         self._request = HoldMirror.Request(holder=name)
         self._renewal: Any = None
-        self._one = threading.Lock()  # held with the mirror
+        self._one = threading.Lock()  # locked while the mirror is held
         self._sending, self._ended = threading.Lock(), False
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(RENEW_S, self._renew, clock=clock, autostart=False)
@@ -220,10 +220,10 @@ class MirrorHolder:
         """Hold the mirror for the block.
 
         Args:
-            asked: the goal or request to do so. Where its `holder` has the mirror already, that hold serves: it is
-                neither renewed nor given back here. Its `take_over` ends the hold of anybody else.
-            purpose: what for and how to end it, for those who are refused meanwhile.
-            duration: s that it will last, about; 0 = not known.
+            asked: the goal or request to do so. If its `holder` has the mirror already, that hold is used: it is
+                neither renewed nor released here. Its `take_over` ends the hold of anybody else.
+            purpose: what it is for and how to end it, for clients that are refused meanwhile.
+            duration: expected duration, s; 0 = not known.
             timeout_s: longest wait for the driver.
             cancelled: ends that wait.
 
@@ -258,10 +258,10 @@ class MirrorHolder:
             self._one.release()
 
     def wait_for(self, free: Callable[[], bool], asked: Any, busy: str, timeout_s: float) -> None:
-        """Wait until `free()`, where `asked` takes the mirror over from a run of this node; that one loses it.
+        """Wait until `free()`, if `asked` takes the mirror over from another run of this node; that run loses it.
 
         Raises:
-            Refusal: BUSY with the sentence `busy`, it does not take it over, or the run does not end in time.
+            Refusal: BUSY with the sentence `busy`: `asked` does not take over, or the run does not end in time.
         """
         deadline = time.monotonic() + timeout_s
         while not free():
@@ -271,14 +271,14 @@ class MirrorHolder:
             time.sleep(0.02)
 
     def command(self, send: Callable[[], Any]) -> Any:
-        """Call `send`, which sends a command, and return what it does. Raises Cancelled after `end`."""
+        """Call `send`, which sends a command, and return its result. Raises Cancelled after `end`."""
         with self._sending:
             if self._ended:
                 raise Cancelled("cancelled: the process ends")
             return send()
 
     def end(self) -> bool:
-        """The process ends: no run sends a command after this call. Returns whether one has the mirror."""
+        """Note that the process ends: no run sends a command from now on. Returns whether a run has the mirror."""
         with self._sending:
             self._ended = True
             return self._one.locked()

@@ -1,4 +1,4 @@
-"""ROS domains for runs that must not meet others on the same machine, and who holds what one wants for oneself."""
+"""ROS domains for runs that must not meet others on the same machine, and which process holds a file or a port."""
 
 import contextlib
 import fcntl
@@ -7,12 +7,12 @@ import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
-#: Where DDS puts the ports of a domain: this many of them for each, from the base on.
+#: UDP ports of DDS: the first one of domain 0, and how many each domain has.
 PORT_BASE, PORTS = 7400, 250
-#: Where the kernel lists the UDP ports that are in use.
+#: Where the kernel lists the UDP ports in use.
 UDP_PORTS = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 PROCESSES = Path("/proc")
-#: Characters of a command that are told.
+#: Number of characters of a command line that are shown.
 COMMAND_MAX = 120
 
 
@@ -26,7 +26,7 @@ def inhabited_domains(tables: Iterable[Path] = UDP_PORTS) -> set[int]:
 
 
 def holders(targets: Collection[Path]) -> list[str]:
-    """Processes that have one of these files open, as far as we may look: their command, id and ROS domain."""
+    """Processes that have one of these files open, as far as permissions allow: command, id and ROS domain."""
     found = []
     for process in PROCESSES.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # not ours, or gone meanwhile
@@ -39,7 +39,7 @@ def holders(targets: Collection[Path]) -> list[str]:
 
 
 def held_by(port: int) -> str:
-    """Who has this TCP or UDP port of the machine, as `holders` names them: " by ..."; "" = not known."""
+    """Which processes hold this TCP or UDP port of the machine, as `holders` names them: " by ..."; "" = not known."""
     sockets = set()
     for table in (*UDP_PORTS, *(path.with_name(path.name.replace("udp", "tcp")) for path in UDP_PORTS)):
         with contextlib.suppress(OSError):
@@ -53,7 +53,7 @@ def held_by(port: int) -> str:
 def own_domain() -> Iterator[int]:
     """Lend a ROS domain that no other demo or test on this machine uses at the same time.
 
-    Nor one in which nodes are left over: those of a run that was killed go on, while its lock ended with it.
+    Domains with leftover nodes are skipped too: nodes of a killed run go on, while its lock ended with it.
     """
     folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
     folder.mkdir(exist_ok=True)

@@ -8,13 +8,13 @@ with care (measured with rclpy 7.1.6):
   the one that raised would wait for the next event, and every later one would be late by one.
 * `async def` service callbacks are not run, and a pending `await` in an action callback is polled at 100 % CPU. Work
   that waits therefore runs in worker threads (see :mod:`dm_common.ros.worker`), and callbacks stay short.
-* It keeps a hold on every entity it serves: a node destroyed before its executor is shut down stays in the ROS graph,
-  latched messages and all. (So does one with action clients or servers, for `Node.destroy_node` passes these over and
-  each holds its node: see `destroy`.)
-* A client may have discovered a server on a busy machine before that one has discovered the client. rmw_fastrtps then
-  waits 0.1 s for it and drops the answer, of which rclpy tells only by a warning ("client will not receive response"):
-  whoever asked waits for ever (ros2/rmw_fastrtps#706, ros2/rclcpp#2760). `until_discovered` sends it again, and says
-  when it is lost for good; the warning is not printed.
+* It keeps a reference to every entity it serves: a node destroyed before its executor is shut down stays in the
+  ROS graph, latched messages and all. (So does one with action clients or servers: `Node.destroy_node` skips these, and
+  each refers to its node, see `destroy`.)
+* On a busy machine a client may have discovered a server before the server has discovered the client. rmw_fastrtps then
+  waits 0.1 s and drops the answer, and rclpy only warns ("client will not receive response"): the client waits for ever
+  (ros2/rmw_fastrtps#706, ros2/rclcpp#2760). `until_discovered` sends the answer again, and reports when it is lost for
+  good; the warning is not printed.
 * A signal may raise KeyboardInterrupt inside any callback, and is not noticed while the loop sleeps. `StopOnSignals`
   turns SIGINT and SIGTERM into an orderly end instead.
 """
@@ -44,14 +44,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_common.ros import SUPERVISOR
 
-#: Signals that end a node in order.
+#: Signals that end a node in an orderly way.
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 #: Longest time the loop sleeps without an event; only bounds the reaction to a shutdown from another thread.
 WAKE_PERIOD_S = 1.0
-#: An answer that took so long to send was dropped, s; others take less than a millisecond.
+#: An answer that took this long to send was dropped, s; others take less than a millisecond.
 DROPPED_S = 0.09
-#: After how long it is sent again, s, each counted from the one before. Each try stops the process for a tenth of a
-#: second, and a client may never match.
+#: Pauses before each further try to send a dropped answer, s. Each try blocks the process for a tenth of a second, and
+#: the client may never be discovered.
 PAUSES_S = (0.3, 1.0, 3.0)
 
 
@@ -111,13 +111,13 @@ def _serve_rest_of_batch(executor: Executor) -> None:
 class StopOnSignals:
     """Turns SIGINT and SIGTERM into a flag and wakes the executor, so that no callback is interrupted half way.
 
-    Made after the executor, which sets handlers of its own.
+    To be made after the executor, which sets handlers of its own.
     """
 
     def __init__(self, executor: Executor) -> None:
         self.requested = False
-        # Python runs a handler when the main thread is back from the executor's C++ code; a byte in this pipe fetches
-        # it from there.
+        # Python runs a handler only once the main thread has returned from the executor's C++ code; a byte in this pipe
+        # makes it return.
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -146,7 +146,7 @@ class BackgroundExecutor:
 
     @property
     def is_here(self) -> bool:
-        """Whether its thread is the one that asks: whoever waited there would wait for itself."""
+        """Whether the caller is in its thread, where waiting for it would be a deadlock."""
         return threading.current_thread() is self._thread
 
     def destroy_node(self) -> None:
@@ -161,8 +161,8 @@ class BackgroundExecutor:
 def destroy(node: Node) -> None:
     """Destroy a node that no executor serves any more, with its action clients and servers.
 
-    `Node.destroy_node` leaves those alone; they refer to each other in circles, so the node would stay in the ROS graph
-    until the garbage collector comes by.
+    `Node.destroy_node` skips those; they form reference cycles, so the node would stay in the ROS graph until the
+    garbage collector runs.
     """
     for waitable in list(node.waitables):
         if isinstance(waitable, ActionClient | ActionServer):
@@ -173,7 +173,7 @@ def destroy(node: Node) -> None:
 def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
     """Run one node as a process: `main()` of every node calls this.
 
-    Shared memory is for one that sends or hears `images`; others do without (`shared_memory.use_udp_alone`).
+    Only nodes that send or receive `images` use shared memory (others: `shared_memory.use_udp_alone`).
 
     The node's `make_safe()`, if it has one, runs after the loop has ended and before anything is destroyed, with SIGINT
     and SIGTERM ignored, so that a second Ctrl-C cannot interrupt the way to the safe shape.
@@ -186,11 +186,11 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
     node: Node | None = None
     executor: Executor | None = None
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # whoever started this may have kept them back until now
-        # A process only: whoever imports a node has no use for these.
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # the parent may have blocked them until now
+        # Only for node processes: programs that import a node do not need these.
         from dm_common.ros import shared_memory, stall
 
-        shared_memory.remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
+        shared_memory.remove_orphaned_segments()  # of killed nodes, such as the predecessor of this one
         if not images:
             shared_memory.use_udp_alone()
         try:
@@ -201,7 +201,7 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
         executor = make_executor(node)
         signals = StopOnSignals(executor)
         stall.watch()
-        # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
+        # Keep what exists now: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()
         gc.freeze()
         supervisor = os.environ.get(SUPERVISOR)
@@ -219,13 +219,13 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
             getattr(node, "make_safe", lambda: None)()
             if executor is not None:
                 executor.shutdown(WAKE_PERIOD_S)
-        rclpy.try_shutdown()  # worker threads know by it that the node is about to go
+        rclpy.try_shutdown()  # by this, worker threads know that the node ends
         if node is not None:
             node.destroy_node()
 
 
 def until_discovered(send: Callable[..., None]) -> Callable[..., None]:
-    """`send`, which repeats an answer that was dropped, from a thread of its own."""
+    """Wrap `send` so that an answer that was dropped is sent again, from a thread of its own."""
 
     def patient(*answer: Any) -> None:
         if _dropped(send, *answer):
@@ -253,7 +253,7 @@ class PatientActionServer(ActionServer):
     async def _execute_goal_request(self, request: Any) -> None:
         self._judged = self._begun = 0.0
         await super()._execute_goal_request(request)
-        # rclpy sends the answer between judging a goal and beginning it.
+        # rclpy sends the answer after judging a goal and before beginning it.
         if self._begun - self._judged >= DROPPED_S:
             answer = self._action_type.Impl.SendGoalService.Response(accepted=True)
             _send_again(self._handle.send_goal_response, request[0], answer)
@@ -264,7 +264,7 @@ class PatientActionServer(ActionServer):
 
 
 def _send_again(send: Callable[..., None], *answer: Any) -> None:
-    """Have an answer that was dropped sent again until its client takes it, or for some seconds."""
+    """Send an answer that was dropped again, from a thread, until its client takes it or all pauses are over."""
 
     def repeat() -> None:
         with suppress(InvalidHandle, rclpy_implementation.RCLError):  # the node has ended

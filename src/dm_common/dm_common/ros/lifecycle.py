@@ -57,21 +57,21 @@ class Diagnostics:
 class ManagedNode(LifecycleNode):
     """A lifecycle node that configures and activates itself, unless its parameter `autostart` is false.
 
-    What a node does in its transitions is in `configure`, `activate`, `deactivate` and `clean_up`. The first two raise
-    ValueError where the parameters will not do: then the node stays as it was, says why, and takes others.
+    Subclasses define the transitions in `configure`, `activate`, `deactivate` and `clean_up`. The first two raise
+    ValueError if the parameters are not acceptable: the node then stays as it was, says why, and accepts other values.
 
     Args:
         name, keywords: of the node.
         table, on_change, check: of its parameters, see `parameters.declare`.
-        hardware_id: in its diagnostics.
+        hardware_id: shown in its diagnostics.
 
     Attributes:
         configured, active: its state.
-        session: of a node that `rests`, changes with every activation and deactivation: goals of before are over.
+        session: if it `rests`, changes with every activation and deactivation, which makes earlier goals invalid.
     """
 
-    #: Whether parameters that are not live change while it is inactive, and requests are refused then with
-    #: NODE_INACTIVE; else they change while it is not configured, and it judges requests by itself.
+    #: True: parameters that are not live change only while the node is inactive, and requests are then refused with
+    #: NODE_INACTIVE. False: they change only while it is not configured, and the node judges requests by itself.
     rests = True
 
     def __init__(
@@ -98,28 +98,28 @@ class ManagedNode(LifecycleNode):
     # --- what nodes do ---
 
     def configure(self) -> None:
-        """Make what the parameters ask for; of a node that `rests` before an activation too, where they changed."""
+        """Set up what the parameters ask for; if the node `rests`, again before an activation if they changed."""
 
     def activate(self) -> None:
-        """Begin."""
+        """Begin to work."""
 
     def deactivate(self) -> None:
         """Rest. Goals end as when they are cancelled."""
 
     def clean_up(self) -> None:
-        """Be as after the start."""
+        """Return to the state after the start."""
 
     def refused(self, reason: str) -> None:
-        """The parameters will not do."""
+        """Called with the reason when the parameters are not acceptable."""
 
     def health(self) -> Health:
-        """Health; of a node that `rests` while it is active."""
+        """Health of the node; if it `rests`, only asked for while it is active."""
         return Health()
 
     # --- what all have in common ---
 
     def inactive(self) -> str:
-        """The reason why it serves no requests and what to do, as a sentence; "" = it does."""
+        """The reason why the node serves no requests, and what to do, as a sentence; "" = it serves them."""
         if self.active:
             return ""
         if self._state_machine.current_state[1] in ("shuttingdown", "finalized"):
@@ -129,7 +129,7 @@ class ManagedNode(LifecycleNode):
         return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"
 
     def check_active(self) -> None:
-        """Raise Refusal when it rests."""
+        """Raise Refusal when the node rests."""
         if self.rests and (reason := self.inactive()):
             raise Refusal(ErrorCode.NODE_INACTIVE, reason)
 
@@ -142,12 +142,12 @@ class ManagedNode(LifecycleNode):
         return not (self.active if self.rests else self.configured)
 
     def autostart(self) -> None:
-        """Configure and activate it unless its parameter says that somebody else will; called when it is served."""
+        """Configure and activate the node unless its parameter `autostart` is false; called when it is served."""
         if self._values["autostart"] and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
     def _answering(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """`change_state` that refuses transitions which its state does not have; rclpy gives no answer at all."""
+        """Wrap `change_state` so that it refuses transitions that its state does not allow; rclpy would not answer."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -160,7 +160,7 @@ class ManagedNode(LifecycleNode):
         return answer
 
     def _done(self, *steps: Callable[[], None]) -> TransitionCallbackReturn:
-        """Take the steps of a transition; what they raise is logged, which rclpy does not."""
+        """Take the steps of a transition and log what they raise, which rclpy does not do."""
         try:
             for step in steps:
                 step()
@@ -177,7 +177,7 @@ class ManagedNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _make(self) -> None:
-        """Configure, unless it was done for the parameters as they are."""
+        """Configure, unless that was already done for the present parameters."""
         if self._made != self._values:
             self._made = None
             self._values.check()

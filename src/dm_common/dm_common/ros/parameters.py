@@ -33,7 +33,7 @@ _TYPES: dict[type | str, RosParameter.Type] = {
 
 #: Marks a parameter that the configuration must give.
 REQUIRED = object()
-#: A name this near to one that is known is a misspelling of it, 0 to 1.
+#: A name this similar (0 to 1) to a known one is taken for a misspelling of it.
 NEAR = 0.75
 
 
@@ -69,7 +69,7 @@ class Parameter:
         return described
 
     def check(self, given: Any) -> Any:
-        """The value that `given` stands for: where a float is wanted, a whole number counts as one.
+        """The value of the parameter for `given`; where a float is wanted, a whole number is accepted.
 
         Raises:
             ParameterError: it is not allowed.
@@ -90,11 +90,11 @@ class Parameter:
 
     @property
     def blank(self) -> Any:
-        """What stands for a value that is missing or wrong: the default, or nothing."""
+        """Placeholder for a value that is missing or wrong: the default, or without one an empty text or NaN."""
         return ("" if self.value.kind is str else math.nan) if self.default is REQUIRED else self.default
 
     def as_ros(self, value: Any) -> RosParameter:
-        """The parameter with a value that `check` returned."""
+        """The ROS parameter with a value that `check` returned."""
         return RosParameter(self.name, _TYPES[self.value.kind], value)
 
     def descriptor(self, read_only: bool = False) -> ParameterDescriptor:
@@ -110,7 +110,7 @@ class Parameter:
         if value.kind is float and bounded:
             descriptor.floating_point_range = [FloatingPointRange(from_value=value.low, to_value=value.high)]
         if value.kind is int and bounded:
-            low = 0 if value.zero else int(value.low)  # what lies between, `check` refuses
+            low = 0 if value.zero else int(value.low)  # `check` refuses what lies between
             descriptor.integer_range = [IntegerRange(from_value=low, to_value=int(value.high))]
         return descriptor
 
@@ -119,7 +119,7 @@ def parameters_of(prefix: str, config: Any) -> Iterator[Parameter]:
     """The parameters that fields of a dataclass declare by `dm_common.values.parameter`, in their order.
 
     Args:
-        prefix: what stands before the names of the fields.
+        prefix: put before the names of the fields.
         config: the dataclass, or an object of it whose values are the defaults.
     """
     for each in fields(config):
@@ -132,7 +132,7 @@ def parameters_of(prefix: str, config: Any) -> Iterator[Parameter]:
 
 #: A parameter that may change while the node runs.
 live = partial(Parameter, live=True)
-#: Of every lifecycle node.
+#: Parameter of every lifecycle node.
 AUTOSTART = Parameter("autostart", switch(True), "Configure and activate by itself after the start.")
 
 
@@ -140,7 +140,7 @@ class Values(dict[str, Any]):
     """Values of a node's parameters by name, as they are now.
 
     Attributes:
-        problems: what is wrong by name, unknown names included; the value of such a one is its default.
+        problems: errors by parameter name, unknown names included; a wrong parameter has its default value.
     """
 
     def __init__(self) -> None:
@@ -154,7 +154,7 @@ class Values(dict[str, Any]):
 
 
 class _RefusedParameterError(ParameterNotDeclaredException):
-    """Answered by rclpy with its text, which is to name the parameter."""
+    """A refusal whose text rclpy gives as the answer, so the text must name the parameter."""
 
     def __init__(self, text: str) -> None:
         Exception.__init__(self, text)
@@ -173,10 +173,10 @@ def declare(
     Every set is checked; accepted changes are put into what is returned, then given to `on_change`.
 
     Args:
-        unlocked: of a lifecycle node: whether parameters that are not live may change now. With it nothing is raised
-            here: the node calls `Values.check` when it is configured, and may be put right before.
-        unlock: transition after which they may.
-        check: raises ValueError for changes that what the node has learnt since denies.
+        unlocked: for a lifecycle node: whether parameters that are not live may change now. If given, nothing is raised
+            here: the node calls `Values.check` when it is configured, and errors can be corrected before.
+        unlock: transition after which they may change.
+        check: raises ValueError for changes that contradict what the node has learnt since.
 
     Raises:
         ParameterError: naming every parameter that is missing, wrong or unknown.
@@ -190,7 +190,7 @@ def declare(
                 node.set_descriptor(parameter.name, parameter.descriptor(read_only=True))
 
     def convert(changes: list[RosParameter]) -> list[RosParameter]:
-        """As `Parameter.check` does; what is wrong stays as it is, to be refused."""
+        """Convert as `Parameter.check` does; a wrong value stays as it is and is refused later."""
         for change in changes:
             if not node.has_parameter(change.name):
                 raise _RefusedParameterError(str(unknown_name("parameter", change.name, by_name)))
@@ -202,7 +202,7 @@ def declare(
                 if (parameter := by_name.get(change.name)) is None:
                     continue
                 value = parameter.check(change.value)
-                # One as it was may be set at any time: `ros2 param load` of a dump sets all that there are.
+                # An unchanged value may be set at any time: `ros2 param load` of a dump sets all parameters.
                 if not (parameter.live or unlocked is None or unlocked() or value == values[change.name]):
                     state = "configured" if unlock == "cleanup" else "active"
                     command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {unlock}"
@@ -227,23 +227,23 @@ def declare(
 
 
 def _declared(node: Node, known: Mapping[str, Parameter]) -> Values:
-    """Declare the parameters of the table with what the configuration gives."""
+    """Declare the parameters of the table with the values that the configuration gives."""
     values = Values()
-    # The one place where rclpy keeps what the configuration gives, the names that nobody declares included.
+    # The only place where rclpy keeps the configured values, including names that nobody declares.
     given: Mapping[str, RosParameter] = node._parameter_overrides
     for name, parameter in known.items():
         value = parameter.default
         if name in given:
             value = given[name].value
             if parameter.value.many and not value:
-                value = []  # ROS makes nothing of an empty list
+                value = []  # ROS gives no value for an empty list
         try:
             if value is REQUIRED:
                 raise ParameterError(f"{name} is required but missing: {parameter.describe().rstrip('.')}")
             values[name] = parameter.check(value)
         except ParameterError as error:
             values[name], values.problems[name] = parameter.blank, str(error)
-        # An array by its type alone would be without a value, which hides all others from `ros2 param dump`.
+        # An array declared by its type alone has no value, which hides all others from `ros2 param dump`.
         node.declare_parameter(name, _TYPES[parameter.value.kind], parameter.descriptor(), ignore_override=True)
         node.set_parameters([parameter.as_ros(values[name])])
     for name in given:
@@ -264,11 +264,11 @@ def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
     except ParameterError as error:
         if change.type_ == _TYPES[parameter.value.kind]:
             return change
-        raise _RefusedParameterError(str(error)) from error  # what rclpy says of another type names no parameter
+        raise _RefusedParameterError(str(error)) from error  # rclpy's own message on a wrong type names no parameter
 
 
 def _numbers(value: Value, given: Any) -> Any:
-    """`given`, where YAML took floats for a text: it does so with 3e-08, and `ros2 param` with it."""
+    """Convert `given` where YAML took floats for text, as it (and `ros2 param`) does with 3e-08."""
     if value.item is not float:
         return given
     texts = given.strip("[]").split(",") if value.many and isinstance(given, str) else given
@@ -281,9 +281,9 @@ def _numbers(value: Value, given: Any) -> Any:
 
 
 def _judge_unknown(node: Node, name: str, known: Mapping[str, Parameter], values: Values) -> None:
-    """A parameter that is given but not declared: refused where it can only be meant for this node, else a warning.
+    """Judge a parameter that is given but not declared: refuse one that can only be meant for this node, else warn.
 
-    A file for all nodes (`/**:`) may well hold what is meant for others.
+    A file for all nodes (`/**:`) may contain parameters that are meant for others.
     """
     groups = {parameter.partition(".")[0] for parameter in known if "." in parameter}
     text = f"{node.get_name()}: {unknown_name('parameter', name, known)}"

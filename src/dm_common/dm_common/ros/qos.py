@@ -1,8 +1,8 @@
-"""Quality-of-service profiles, one per kind of topic, and whether a node that one depends on is alive.
+"""Quality-of-service profiles, one per kind of topic, and a watch on whether a node that one depends on is alive.
 
-A service of a process that was killed stays in the ROS graph for 20 s, and its clients wait on. DDS asserts liveliness
-for every publisher with a lease, whatever is published; so the nodes that others wait for give a topic one, and those
-who wait watch it here: they know within a second, also after kill -9.
+A service of a killed process stays in the ROS graph for 20 s, and its clients keep waiting. DDS asserts liveliness for
+every publisher with a lease, whatever it publishes. So each node that others wait for publishes one topic with a lease,
+and those who wait watch it here: they know within a second, also after kill -9.
 """
 
 import time
@@ -25,24 +25,24 @@ STATE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 #: Facts that late joiners need (calibration, capabilities, mirror info).
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-#: Services that many ask at once: a server keeps as many requests, and answers on their way, as this, whoever they are
-#: from. With the default of 10 a hundred clients at once lose one request in five (measured).
+#: Services that many clients call at once: depth of the queues of requests, and of answers under way, that all clients
+#: of a server share. With the default of 10 a hundred clients at once lose one request in five (measured).
 SERVICE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 #: Surface maps of several megabytes. Reliable, because best effort loses whole maps once they exceed the transport's
 #: datagram size (ros2/rmw_fastrtps#739).
 MAP = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
-#: A publisher whose process does not say for so long that it lives counts as dead, s.
+#: A publisher whose process has not asserted its liveliness for this time counts as dead, s.
 LEASE_S = 1.0
-#: A node counts as dead once it has been lost for so long, s: a machine that stalls loses all nodes for a moment.
+#: A node counts as dead once it has been lost for this time, s: a machine that stalls loses all nodes for a moment.
 SURE_S = 0.7
-#: A node that has not appeared for so long after the one that watches it was started is missing, s.
+#: A node that has not appeared for this time after the start of the node that watches it is missing, s.
 APPEAR_S = 5.0
-#: A node that was started again is known to one process sooner than to another, up to seconds on a busy machine: a call
-#: to one that is lost waits for so long before it counts as dead, s.
+#: A restarted node is discovered by some processes sooner than by others, seconds apart on a busy machine: a call to a
+#: node that is lost waits for this time before the node counts as dead, s.
 RETURN_S = 1.2
-#: What became of a node that is lost.
+#: Text on a node that is lost.
 GONE = "has died, was stopped or hangs: start it again"
 
 
@@ -57,8 +57,8 @@ def with_lease(profile: QoSProfile) -> QoSProfile:
 class Liveliness:
     """Watches the publisher of a topic by a subscription of its own, whose messages it does not even decode.
 
-    Made by `watch`: with two such subscriptions in one process Fast DDS counts a living publisher as dead when it
-    forgets one that was killed, 20 s later (measured; the first of them is told the state of whichever publisher
+    Made by `watch`: with two such subscriptions in one process, Fast DDS counts a living publisher as dead when it
+    forgets one that was killed, 20 s later (measured; the first of them is given the state of whichever publisher
     `LivelinessManager::remove_writer` passed last).
 
     A publisher without a lease is not seen at all: nothing is known of it.
@@ -72,7 +72,7 @@ class Liveliness:
     Attributes:
         name: of the node that is watched.
         lost: there was a publisher, and now there is none.
-        starts: how many came one after the other; 0 = there was none yet.
+        starts: number of publishers that came one after the other; 0 = there was none yet.
     """
 
     def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
@@ -91,7 +91,7 @@ class Liveliness:
         )
 
     def heard(self) -> None:
-        """Note that a message of the node has come: who speaks lives, whatever a lease says that lapsed."""
+        """Note that a message of the node has come: it is then alive, even if its lease has lapsed."""
         self._heard_at = time.monotonic()
 
     def wait_for_return(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -107,9 +107,9 @@ class Liveliness:
             time.sleep(0.02)
 
     def missing(self, served: Callable[[], bool] = lambda: True) -> bool:
-        """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for.
+        """Whether the node is lost, or never appeared and does not serve what `served` looks for.
 
-        Without that, one that never came is not missing.
+        Without `served`, a node that never appeared is not missing.
         """
         now = time.monotonic()
         if self.lost:
@@ -117,18 +117,18 @@ class Liveliness:
         return not self.starts and now - self._born > APPEAR_S and not served()
 
     def changed_within(self, duration_s: float) -> bool:
-        """Whether the node is lost, or came back or came at all within so long."""
+        """Whether the node is lost, or has appeared or come back within this time."""
         return self.lost or time.monotonic() - self._changed_at < duration_s
 
     @property
     def text(self) -> str:
-        """What became of a node that is missing, and what to do."""
+        """What happened to a node that is missing, and what to do."""
         return f"the node {self.name} {GONE if self.starts else 'is not running: start it'}"
 
     def since_now(self, served: Callable[[], bool] = lambda: True) -> Callable[[], str]:
-        """What says whether the node is missing, or was started anew since this call: then no answer comes any more.
+        """Return a function that checks whether the node is missing or was restarted since: then no answer can come.
 
-        It returns what became of the node and what to do, as a sentence; "" = it may answer.
+        That function returns what happened and what to do, as a sentence; "" = the node may still answer.
         """
         starts = max(self.starts, 1)
 
@@ -141,8 +141,8 @@ class Liveliness:
 
     def _on_change(self, info: Any) -> None:
         lost = info.alive_count == 0
-        # A publisher that comes back after its lease lapsed only leaves the other count. That the first one has come is
-        # not always heard, when it came before the executor did; whatever changes afterwards, there was one.
+        # A publisher that returns after its lease lapsed only leaves the count of those not alive. If the first one
+        # came before the executor, its arrival may go unnoticed; any later change shows that there was one.
         started = info.alive_count_change + info.not_alive_count_change > 0
         self.starts = max(self.starts + started, 1)
         if lost != self.lost:
@@ -153,7 +153,7 @@ _watches: WeakKeyDictionary[Node, dict[str, Liveliness]] = WeakKeyDictionary()
 
 
 def watch(node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> Liveliness:
-    """The one watch of this node on a topic; arguments as those of `Liveliness`."""
+    """The single watch of this node on a topic; arguments as those of `Liveliness`."""
     own = _watches.setdefault(node, {})
     if topic not in own:
         own[topic] = Liveliness(node, name, message_type, topic, profile)

@@ -8,20 +8,20 @@ from pathlib import Path
 
 from rclpy.utilities import get_rmw_implementation_identifier
 
-#: What names the Fast DDS profile, how far nodes look for each other, and machines beyond.
+#: Environment variables: the Fast DDS profile, how far nodes look for each other, and peers on other machines.
 PROFILE, RANGE, PEERS = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
-#: The profiles of dm_bringup.
+#: The profiles of dm_bringup: with shared memory, UDP only, and UDP only within the machine.
 WHOLE, UDP, UDP_LOCAL = "fastdds.xml", "fastdds_udp.xml", "fastdds_udp_local.xml"
-#: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
+#: Folder of the segments of Fast DDS; age up to which a segment may not be locked by its process yet, s.
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 
 
 def use_udp_alone() -> None:
-    """Let this process do without shared memory: by one of the profiles for that, beside the one of the suite.
+    """Keep this process from using shared memory, by one of the profiles for that beside the one of the suite.
 
-    To be called before ROS is initialised. With LOCALHOST, rmw_fastrtps would add shared memory to any profile: one
-    that is kept to the machine by itself stands for it. All stays with a profile of the user's own, with another
-    middleware, for which only LOCALHOST keeps to the machine, and with peers beside LOCALHOST, which alone heeds them.
+    To be called before ROS is initialised. With LOCALHOST, rmw_fastrtps would add shared memory to any profile, so a
+    profile that keeps to the machine replaces it. Nothing changes with a profile of the user's own, with another
+    middleware (which only LOCALHOST keeps to the machine), or with peers beside LOCALHOST (heeded only with LOCALHOST).
     """
     profile, local = Path(os.environ.get(PROFILE) or "none"), os.environ.get(RANGE) == "LOCALHOST"
     alone = profile.with_name(UDP_LOCAL if local else UDP)
@@ -43,7 +43,7 @@ def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
     for lock in SHARED_MEMORY.glob("fastrtps_*_el"):
         if lock.name.startswith("fastrtps_port"):
             continue
-        # Locked, somebody else's, or removed by another node at this moment: left alone.
+        # Segments that are locked, owned by others, or just being removed by another node are left alone.
         with suppress(OSError), lock.open("r+b") as handle:
             if time.time() - lock.stat().st_mtime >= least_age_s:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,8 +1,8 @@
-"""Ends a node whose middleware stands still, so that whoever started it starts it again.
+"""Ends a node whose middleware is deadlocked, so that whoever started it starts it again.
 
-Fast DDS 2.14 locks itself up once in a while when a client leaves: the thread that takes the client out holds the
-participant's mutex and waits for the thread of timed events, which wants that mutex to say that the node lives
-(eProsima/Fast-DDS#6502). The process lives on, but hears nothing and is not heard, for ever.
+Fast DDS 2.14 occasionally deadlocks when a client leaves: the thread that removes the client holds the participant's
+mutex and waits for the thread of timed events, which needs that mutex to assert the node's liveliness
+(eProsima/Fast-DDS#6502). The process stays alive, but neither receives nor sends anything any more.
 """
 
 import math
@@ -16,14 +16,14 @@ from pathlib import Path
 
 from rclpy.logging import get_logger
 
-#: The threads of this process, and how those for timed events are named.
+#: The threads of this process, and the prefix of the names of those for timed events.
 TASKS, NAME = Path("/proc/self/task"), "dds.ev."
-#: Wall time between two looks, s, and how many in a row must see such a thread where it was, after it has been seen to
-#: wake. They wake up for each lease and at least at every announcement: each second by config/fastdds.xml of
-#: dm_bringup, every three without it. Looks are counted, and not the time: a process that was stopped, or a machine
-#: that slept, goes on where it was.
+#: Pause between two checks, s (wall time), and how many in a row must find such a thread without a new wake-up, after
+#: it has been seen to wake. These threads wake for each lease and at least for every announcement: each second with
+#: config/fastdds.xml of dm_bringup, every three without it. Checks are counted rather than time, so that a stopped
+#: process or a machine that slept continues where it was.
 LOOK_S, LOOKS = 3.0, 15
-#: Time for the way to the safe shape, s; what takes longer is cut off, for nothing after it comes to an end.
+#: Time allowed for the way to the safe shape, s; then the process is cut off, since what follows would never end.
 END_S = 15
 
 
@@ -33,7 +33,7 @@ def watch() -> None:
 
 
 def wakes(tasks: Path = TASKS) -> dict[str, int]:
-    """{thread: how often it has gone to sleep}, of the threads for timed events; {} with another middleware."""
+    """{thread: number of its voluntary waits}, of the threads for timed events; {} with another middleware."""
     found: dict[str, int] = {}
     for task in tasks.iterdir() if tasks.is_dir() else ():
         with suppress(OSError, StopIteration):  # it has just ended
@@ -44,7 +44,7 @@ def wakes(tasks: Path = TASKS) -> dict[str, int]:
 
 
 def _watch(pause: float, stand_still: Callable[[], None], tasks: Path = TASKS) -> None:
-    seen: dict[str, tuple[int, float]] = {}  # times it slept, and looks that found no more
+    seen: dict[str, tuple[int, float]] = {}  # number of its waits, and checks without a new one
     while now := wakes(tasks):
         for thread, count in now.items():
             before, looks = seen.get(thread, (count, -math.inf))
@@ -56,8 +56,8 @@ def _watch(pause: float, stand_still: Callable[[], None], tasks: Path = TASKS) -
 
 
 def end() -> None:
-    """End this process in order as far as that goes: the loop ends, the mirror is made safe."""
-    signal.alarm(END_S)  # of the system, and first: what is stuck may hold Python's lock, or that of the log
+    """End this process in as orderly a way as possible: the loop ends, the mirror is made safe."""
+    signal.alarm(END_S)  # by the kernel, and first: what is stuck may hold Python's lock, or the log's
     get_logger("dm_common.ros").error(
         "the middleware stands still (eProsima/Fast-DDS#6502): this node ends, and is to be started again"
     )

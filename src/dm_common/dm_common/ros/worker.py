@@ -1,4 +1,4 @@
-"""Work that waits, beside an executor that never does.
+"""Worker threads for work that has to wait, beside an executor that never waits.
 
 A service or action callback that would block (settling, files, fits, other services) runs as ordinary code in a worker
 thread; its outcome is handed back to the executor, which sends the response. While it runs, streams are served
@@ -25,11 +25,11 @@ from dm_common.ros import qos
 from dm_common.ros.executor import PatientActionServer, until_discovered
 from dm_common.values import Fields, without_figures
 
-#: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
+#: Every known client fetches its result at once; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
 #: Longest wait for a simulator's first message on /clock, s.
 CLOCK_S = 10.0
-#: Of requests that hold nothing that could be wrong, or are checked by whoever takes them.
+#: For requests without anything to check, or checked by their handler.
 NO_FIELDS = Fields({})
 
 
@@ -40,7 +40,7 @@ def _check_active(node: Node) -> None:
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
     """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL."""
-    if node.context.ok():  # else the process is ending: what a worker still used is gone, and so is who asked
+    if node.context.ok():  # else the process is ending: what the worker used, and the client, are gone
         node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
     answer_with(answer, ErrorCode.INTERNAL, f"{type(error).__name__}: {error}")
 
@@ -50,9 +50,9 @@ def never_silent(
 ) -> Callable[[Any, Any], Any]:
     """`callback(request, response) -> response` of service `name` that answers with an error code instead of raising.
 
-    A service whose callback raises sends no answer: whoever called it waits until its patience ends. What is EXPECTED
-    is answered with its own code and logged as a warning, once however often it repeats; requests whose `fields` may
-    not be as they are never come to `callback`.
+    A service whose callback raises sends no answer, and its caller waits until it gives up. An EXPECTED error is
+    answered with its own code and logged as a warning, once even if it repeats. Requests with `fields` that are not
+    allowed never reach `callback`.
     """
     refused = ""
 
@@ -64,7 +64,7 @@ def never_silent(
             fields.check(request)
             return callback(request, response)
         except EXPECTED as error:
-            if response == type(response)():  # else the callback knows already what it has filled in
+            if response == type(response)():  # otherwise the callback has filled it in already
                 without_figures(response)
             refused = str(error)
             answer_with(response, error_code(error), refused)
@@ -81,8 +81,8 @@ class WorkerService:
     """A service whose callback runs in a worker thread.
 
     `callback(request, response) -> response` may block. Requests of one service are served one after another, in order;
-    `fields` are checked first. It may return a function instead, which waits for the end of what has begun and returns
-    the response: the next request is served meanwhile; where it begins something too, that must end the wait.
+    `fields` are checked first. The callback may return a function instead, which waits for the end of what has begun
+    and returns the response. The next request is served meanwhile; if it begins something too, that must end the wait.
     """
 
     def __init__(
@@ -92,8 +92,8 @@ class WorkerService:
         self._callback = never_silent(node, name, callback, fields)
         self._pool, self._ends = (ThreadPoolExecutor(1, name.replace("/", "_") + end) for end in ("", "_end"))
         self._service: Service = node.create_service(srv_type, name, lambda *both: both, qos_profile=qos.SERVICE)
-        # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
-        # where the header that a later answer needs can be had.
+        # The executor calls `callback` and passes its result to `send_response(response, header)`: the only access to
+        # the header, which a later answer needs.
         self._send = until_discovered(self._service.send_response)
         self._service.send_response = self._start
 
@@ -121,7 +121,7 @@ class WorkerGoal:
     Attributes:
         handle: of rclpy.
         request, publish_feedback: of the handle.
-        since: steady time when it came, s.
+        since: steady time of its arrival, s.
     """
 
     def __init__(self, handle: ServerGoalHandle, node: Node) -> None:
@@ -135,12 +135,12 @@ class WorkerGoal:
 
     @property
     def is_cancel_requested(self) -> bool:
-        """Whether it is to end."""
+        """Whether the goal is to end."""
         return bool(self.handle.is_cancel_requested or self.ended_by)
 
     @property
     def ended_by(self) -> str:
-        """What ends it other than its client, as a sentence; "" = nothing."""
+        """What ends the goal other than its client, as a sentence; "" = nothing."""
         if self._session != self._begun:
             return f"{self._node.get_name()} was deactivated"
         return "a newer goal has taken over" if self.taken_over else ""
@@ -155,10 +155,10 @@ class WorkerActionServer(PatientActionServer):
     Args:
         exclusive: "refuse" refuses a goal while another runs, unless it sets `take_over`: then the running goal is
             cancelled; "preempt" asks the running goal to stop and starts the newest one after it.
-        fields, admit: of the goal, and what raises the Refusal of one and logs it.
+        fields, admit: checks of the goal's fields, and a function that raises, and logs, the Refusal of a goal.
 
-    Every goal is accepted, and one that is refused aborted, for only a result has room for the reason. No other goal
-    hears of it.
+    Every goal is accepted, and a refused one is then aborted, since only a result has room for the reason. A refused
+    goal does not affect others.
     """
 
     def __init__(
@@ -203,8 +203,8 @@ class WorkerActionServer(PatientActionServer):
             return self._newest is not goal
 
     def _check_free(self, goal: Any) -> None:
-        """Raise Refusal while another goal runs that this one leaves alone."""
-        asked = getattr(goal, "request", goal)  # a FocusRequest has the field where the goal is about one
+        """Raise Refusal while another goal runs that this one does not take over."""
+        asked = getattr(goal, "request", goal)  # `take_over` may be in a FocusRequest inside the goal
         if self._exclusive == "refuse" and self.busy and not asked.take_over:
             assert self._newest is not None
             lasts = time.monotonic() - self._newest.since
@@ -212,7 +212,7 @@ class WorkerActionServer(PatientActionServer):
             raise Refusal(ErrorCode.BUSY, text)
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
-        """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
+        """Run the body in a thread; rclpy's own execution only publishes the outcome once it is known."""
         try:
             try:
                 _check_active(self._worker_node)
@@ -251,7 +251,7 @@ class WorkerActionServer(PatientActionServer):
         self._finish(goal.handle, outcome, result)
 
     def _finish(self, goal_handle: ServerGoalHandle, outcome: str, result: Any) -> None:
-        """Have the executor publish the outcome."""
+        """Make the executor publish the outcome."""
 
         def finish(_goal_handle: ServerGoalHandle) -> Any:
             # Only a goal whose client requested its cancellation may end as cancelled.
@@ -279,13 +279,13 @@ def wait_for_clock(clock: Clock) -> None:
 
 
 def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
-    """Sleep in a worker thread; in ROS time where that is simulated, which may run fast, or begin anew meanwhile.
+    """Sleep in a worker thread; in ROS time if that is simulated, which may run fast or restart meanwhile.
 
     Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
     raises ClockError after 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
-    ticking = clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)  # the other may be set
+    ticking = clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)  # system time may be set
     end = ticking.now() + (whole := Duration(nanoseconds=round(seconds * 1e9)))
     give_up = time.monotonic() + 10.0 + 10.0 * seconds
     while (remaining := (end - ticking.now()).nanoseconds * 1e-9) > 0:

@@ -9,7 +9,7 @@ beforehand. Two things keep it from diverging:
 - when the error grew nevertheless, the next correction is halved, once more each time.
 
 Creep goes on while the loop measures: after a large move the surface drifts more between two early maps than a
-correction misses. A loop that is told the law of the actuators aims at the time of the next map.
+correction misses. Given the law of the actuators, the loop aims at the time of the next map.
 
 The best command seen is kept. Damped corrections lie between two legal commands, so they are legal as well.
 """
@@ -31,14 +31,14 @@ from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
 
-#: Bounds of the factor on a correction that the watched response may ask for.
+#: Bounds of the factor by which the observed response may scale a correction.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5
-#: Changes smaller than this (m) say more of the noise than of the response, and growth by less is no divergence.
+#: Changes below this (m) show noise rather than the response, and growth by less is no divergence.
 CHANGE_MIN = 3e-9
-#: Corrections below this factor would never converge: an error that still grows is not the loop's.
+#: Lower bound of the damping: weaker corrections would not converge, and further growth has another cause.
 DAMPING_MIN = 0.1
-#: The best command is written again at the end when the last was so much worse. Nearer ones are the same but for noise,
-#: and going back costs hysteresis.
+#: The best command is written again at the end if the last error was larger by this factor. Smaller differences are
+#: noise, and going back costs hysteresis.
 RESTORE_RATIO = 1.5
 
 
@@ -59,12 +59,12 @@ class LoopOptions:
 
 
 class Creep:
-    """Foresees creep from the map just taken to the next, which will take as long as this one did.
+    """Predicts creep from the map just taken to the next one, which is assumed to take as long as this one did.
 
     Args:
-        law: of the actuators; one that does not creep foresees nothing.
-        state: before the loop's first command, which goes out next.
-        now: the plant's time, s, in steady advance, of the clock of `state`.
+        law: of the actuators; without creep, zero is predicted.
+        state: before the loop's first command, which comes next.
+        now: the plant's time, s, on the clock of `state`; it must advance steadily.
     """
 
     def __init__(self, law: HysteresisModel, state: HysteresisState, now: Callable[[], float]) -> None:
@@ -73,16 +73,16 @@ class Creep:
 
     @classmethod
     def of_rate(cls, rate: float, signals: Floats, now: Callable[[], float]) -> Creep:
-        """Of actuators without hysteresis that creep by `rate` per decade and have long stood at `signals` (N,)."""
+        """For actuators without hysteresis that creep by `rate` per decade and have long stood at `signals` (N,)."""
         law = HysteresisModel.linear(rate)
         return cls(law, rested(law, signals, now()), now)
 
     def moved(self, signals: Floats) -> None:
-        """The plant went to `signals` (N,) just now."""
+        """Note that the plant has just gone to `signals` (N,)."""
         self._state = self._law.move(self._state, signals, self._now())
 
     def foreseen(self) -> Floats:
-        """(N,) change of the effective signals until the next map."""
+        """(N,) predicted change of the effective signals until the next map."""
         law, now = self._law, self._now()
         self._state = law.advance(self._state, now)
         then = law.advance(self._state, 2.0 * now - self._last)
@@ -135,16 +135,16 @@ class LoopResult:
 
 
 class StoppedLoop(Cancelled):
-    """The loop was asked to stop after so many maps."""
+    """The loop was asked to stop after this number of maps."""
 
     def __init__(self, maps: int) -> None:
         super().__init__(f"cancelled after {maps} maps; the mirror holds the last command")
 
 
 def response_ratio(asked: Shape, seen: Shape) -> float:
-    """Share of a change that was seen, by least squares over the coefficients beyond tilt; NaN when too little moved.
+    """Observed share of the change asked for, by least squares over coefficients beyond tilt; NaN if too little moved.
 
-    Coefficients count by their rms sag.
+    Coefficients are weighted by their rms sag.
     """
     factors = TERM_RMS[PISTON_TILT : len(asked.coefficients)]
     wanted, got = factors * asked.coefficients[PISTON_TILT:], factors * seen.coefficients[PISTON_TILT:]
@@ -167,7 +167,7 @@ def converge(
 
     Args:
         start: (N,) signals to begin with; None = the solver's open-loop command.
-        creep: to foresee creep by; None = do not.
+        creep: predicts creep; None = do not correct for it.
         on_step: called after each map.
 
     Raises:
@@ -217,7 +217,7 @@ def converge(
             drift = response(model, creep.foreseen())
         better, limits = solver.correct(signals, error + drift).signals, solver.limits
         further = np.clip(signals + scale * damping * (better - signals), limits.low, limits.high)
-        # Beyond the full step only as far as the limits go; to draw neighbours together would shrink the whole shape.
+        # A longer step is clipped to the range, but not scaled for the neighbours: that would shrink the whole shape.
         signals = further if limits.allow_neighbours(further) else better
         if used_up:
             break

@@ -22,7 +22,7 @@ from dm_controller.solvers.registry import make_solver
 
 
 def run_converge(bench: LoopBench, handle: WorkerGoal) -> tuple[str, Any]:
-    """Outcome and result of a goal, with the best of what was measured; blocks, in the worker thread of the action."""
+    """Outcome and result of a goal, with the figures of the best map; blocks, in the worker thread of the action."""
     steps: list[LoopStep] = []
     goal, result = handle.request, without_figures(Converge.Result())
     feedback = without_figures(Converge.Feedback())
@@ -47,7 +47,7 @@ def run_converge(bench: LoopBench, handle: WorkerGoal) -> tuple[str, Any]:
 
 
 def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tuple[int, str]:
-    """Carry it out; returns an ErrorCode and a sentence."""
+    """Carry out the goal; returns an ErrorCode and a sentence."""
     values = bench.parameters
     options = LoopOptions(  # 0 = as configured
         goal.tolerance or values["converge.tolerance"], goal.max_maps or values["converge.max_maps"]
@@ -55,7 +55,7 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
     bench.move(goal.request)  # refused before anything is waited for
     solver = solver_of(bench.active_calibration(), goal.method)
     bench.check_ready()
-    goal.request.mode = FocusRequest.MODE_DIRECT  # it goes from where the mirror stands, by the law of the actuators
+    goal.request.mode = FocusRequest.MODE_DIRECT  # from the present state, by the law of the actuators
     move = bench.move(goal.request)
     try:
         found = converge(
@@ -83,12 +83,12 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
 
 
 def _creep(bench: LoopBench) -> Creep | None:
-    """By the law in use and what is known of the actuators; without a law of creep, by the configured rate."""
+    """Predicts creep by the law in use and the actuators' state; without a law of creep, by the configured rate."""
     law = bench.active_calibration().planner.law
     if law.creep_rate:
         state = bench.hysteresis()
         return Creep(law, state, bench.now) if state is not None else None
-    # A mirror that is not known to stand somewhere gives no move to foresee creep from.
+    # Without a known present shape, there is no move from which to predict creep.
     applied = bench.applied()
     return None if applied is None else Creep.of_rate(bench.parameters["converge.creep"], applied, bench.now)
 

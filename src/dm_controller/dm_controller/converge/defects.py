@@ -1,7 +1,7 @@
-"""What maps show of a model: its defect, measured less predicted surface, as a field over effective signals.
+"""The defect of a model, measured minus predicted surface, as a field over effective signals, found from maps.
 
-Neighbouring shapes have about the same defect, so that of a shape is estimated from all rounds of maps
-(`planning.recipes.Kriging`), each as sure as the noise of its maps permits.
+Neighbouring shapes have nearly the same defect, so the defect of a shape is estimated from all rounds of maps
+(`planning.recipes.Kriging`), each weighted by the noise of its maps.
 """
 
 import math
@@ -14,7 +14,7 @@ from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.recipes import Kriging
 from dm_controller.solvers.base import Floats, Shape
 
-#: No mean of maps is surer than this, m.
+#: Lower bound of the standard deviation of a mean of maps, m.
 SIGMA_MIN = 1e-12
 
 
@@ -26,10 +26,10 @@ def mean_of(shapes: Sequence[Shape]) -> Shape:
 
 
 class Defects:
-    """The rounds of one run.
+    """The defects found in the rounds of one run.
 
     Args:
-        model: whose defect it is.
+        model: the model that has the defect.
     """
 
     def __init__(self, model: InfluenceModel) -> None:
@@ -37,7 +37,7 @@ class Defects:
         self._aims: list[Floats] = []
         self._means: list[Shape] = []
         self._maps: list[int] = []
-        # Squares (K - 3,) of what maps scatter about the means of their rounds, and their degrees of freedom.
+        # Sums of squares (K - 3,) of the deviations of maps from their round's mean, and their degrees of freedom.
         self._scatter, self._freedom = np.zeros(len(model.zernike_offset) - PISTON_TILT), 0
 
     def add(self, aim: Floats, maps: Sequence[Shape]) -> None:
@@ -48,7 +48,7 @@ class Defects:
         self._maps.append(len(maps))
 
     def spread(self, maps: Sequence[Shape]) -> float:
-        """Standard deviation of the worst coefficient of the mean of a round, m, by what all maps scatter."""
+        """Standard deviation, m, of the worst coefficient of the mean of a round, from the scatter of all maps."""
         scatter, freedom = self._scattered(maps)
         return math.sqrt(scatter.max() / max(freedom, 1) / len(maps))
 

@@ -1,11 +1,11 @@
 """Building recipes on the bench: condition the mirror, go to the shape, measure, correct, and begin again.
 
-Knows no ROS. Every round begins with a degauss, for a recipe holds from that condition only. Its maps are averaged
-until their mean is sure. Creep goes on meanwhile and the electronics write whole steps only; the hysteresis model says
-how far the effective signals were from the wanted ones at each map, and the influence function takes that off. What
-remains of a map is the defect of the model at the effective signals of the shape. That of the next shape is estimated
-from all rounds so far (`converge.defects`): most shapes are right at once, and their only round is the one that
-re-measures them. In the end each recipe rests on its neighbours' maps too.
+Knows no ROS. Every round begins with a degauss, since a recipe holds only from that condition. Its maps are averaged
+until the mean is accurate enough. Meanwhile creep goes on, and the electronics quantise. The hysteresis model gives the
+deviation of the effective signals from the wanted ones at each map, and the influence function its effect, which is
+subtracted. What remains of a map is the defect of the model at the effective signals of the shape. That of the next
+shape is estimated from all rounds so far (`converge.defects`): most shapes are right at once, and their only round is
+the one that re-measures them. In the end each recipe uses its neighbours' maps too.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,9 +24,9 @@ from dm_controller.planning.recipes import Corrections, UnreachableError, target
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag
 
-#: Effective signals that limits deny count from here on.
+#: Deviation of an effective signal, where a limit binds, up to which a recipe keeps the effective signals aimed at.
 MISS_IGNORED = 1e-3
-#: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
+#: A round ends once the standard error of its mean is this share of the tolerance; fewest maps that show their noise.
 SURE_SHARE, MAPS_MIN = 0.2, 3
 
 
@@ -36,10 +36,10 @@ class BuildOptions:
 
     Attributes:
         tolerance: largest coefficient error beyond tilt, m, re-measured.
-        maps_max: maps that one recipe may take: at least one round to correct by and one to re-measure.
-        average: most maps of one round; of fewer than 2 the noise is not known.
+        maps_max: most maps of one recipe: at least one round to correct by and one to re-measure.
+        average: most maps of one round; fewer than 2 do not show the noise.
         settle_time: s after the move at which the shape is to be right.
-        reachable: largest coefficient error, m, by which limits may deny a shape from the condition.
+        reachable: largest coefficient error, m, that limits may leave in a shape reached from the condition.
     """
 
     tolerance: float = 6.3e-10
@@ -51,7 +51,7 @@ class BuildOptions:
 
 @dataclass(frozen=True)
 class BuildStep:
-    """After one map.
+    """Progress after one map.
 
     Attributes:
         curvature: 1/m, of the recipe.
@@ -73,7 +73,7 @@ class _Round:
 
     Attributes:
         target, signals: what was wanted, and (N,) what was written.
-        aim: (N,) effective signals.
+        aim: (N,) effective signals of the shape.
         defect: measured less predicted surface at `aim`.
         maps: taken.
     """
@@ -92,9 +92,9 @@ class RecipeBuilder:
         loop: plans moves; without a hysteresis model its effective signals are signals.
         plant: the bench.
         now: the plant's time, s, of the clock that maps are stamped with.
-        state: what the mirror remembers so far, creep above all; None = taken to be long rested at mid range.
+        state: what the mirror remembers so far, mainly creep; None = demagnetised and long at rest at mid range.
         on_step: called after each map.
-        cancelled: asked before each map.
+        cancelled: called before each map.
 
     Attributes:
         state: what the mirror remembers now.
@@ -128,7 +128,7 @@ class RecipeBuilder:
 
         Raises:
             TargetError: no such surface exists over the aperture.
-            UnreachableError: the limits deny the shape.
+            UnreachableError: the limits do not allow the shape.
             Cancelled: `cancelled()` became true.
             Refusal, ValueError: the bench failed, or its maps are of another kind than the calibration's.
         """
@@ -145,14 +145,14 @@ class RecipeBuilder:
 
     @property
     def recipes(self) -> tuple[Recipe, ...]:
-        """Those built, in order, by all that was measured so far.
+        """The recipes built, in order, from all that was measured so far.
 
-        Figures are of each shape's last round, which judged signals found before it: so they flatter nothing.
+        Their errors are those of each shape's last round, whose signals were found before it, so they are unbiased.
         """
         return tuple(self._recipe(taken, maps) for taken, maps in self._built)
 
     def _recipe(self, taken: _Round, maps: int) -> Recipe:
-        """By all that was measured so far; `taken` is the last round of its shape, of `maps` in all."""
+        """From all that was measured so far; `taken` is the last round of its shape, and `maps` counts all its maps."""
         error = self._error(taken)
         return Recipe(
             curvature=taken.target.curvature,
@@ -166,11 +166,11 @@ class RecipeBuilder:
         )
 
     def _error(self, taken: _Round) -> Shape:
-        """What was measured in a round, less what was wanted."""
+        """The surface measured in a round, minus the wanted one."""
         return self._predicted(taken.aim) + taken.defect - target_shape(taken.target, self._loop.mirror.model)
 
     def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
-        """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without any."""
+        """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without a defect."""
         mirror = self._loop.mirror
         wanted, tilt = mirror.wanted(target)
         change = wanted if near is None else wanted - self._defects.at(near)
@@ -184,13 +184,13 @@ class RecipeBuilder:
         """Condition the mirror and move it to the effective signals `aim`.
 
         Returns:
-            (N,) signals written, and (N,) the effective signals to keep: others than `aim` where limits deny those.
+            (N,) signals written, and (N,) the effective signals to keep: `aim`, or what the limits allow instead.
         """
         law, plant = self._loop.law, self._plant
         self._stop_if_cancelled()
         began = self._now()
         plant.degauss()
-        # While it swings about the middle, creep follows the middle.
+        # During the swings about the middle, creep follows the middle.
         self.state = law.advance(law.degaussed(self.state, began, self._middle), self._now())
         move = self._loop.plan(target, self.state, self._now(), effective=aim, ahead=self._options.settle_time)
         applied = plant.apply(move.signals)
@@ -219,7 +219,7 @@ class RecipeBuilder:
             measured = self._plant.measure(f"recipe {shape_text(target)} {before + number}")
             self.maps += 1
             surface = measured_shape(measured.coefficients, measured.sag, model)
-            # A map tells when it was taken; one that does not was taken now.
+            # The time of the map by its stamp, limited to the time between the last state and now.
             seen = min(max(1e-9 * measured.stamp_ns, self.state.time), self._now())
             defects.append(surface - self._predicted(law.effective(law.advance(self.state, seen))))
             taken = _Round(target, signals, aim, mean_of(defects), number)
@@ -234,7 +234,7 @@ class RecipeBuilder:
         return taken
 
     def _hold(self, aim: Floats) -> None:
-        """Keep the shape against creep as it is kept in use: what the law misses of that becomes part of the recipe."""
+        """Correct the shape for creep as in use, so that the law's error in that becomes part of the recipe."""
         law = self._loop.law
         if not law.has_history:
             return
@@ -249,10 +249,10 @@ class RecipeBuilder:
 def recipe_book(
     recipes: Sequence[Recipe], loop: Planner, degauss_steps: int, stamp_ns: int, before: RecipeBook = NO_RECIPES
 ) -> RecipeBook:
-    """Recipes of one run as a book; its figures are of the whole that they make with those there were `before`.
+    """Recipes of one run as a book; its interpolation error is that of these together with the recipes `before`.
 
     Args:
-        loop: of the calibration as it is now: their own maps may have been taken into it while they were built.
+        loop: of the calibration as it is now, which may have taken in the recipes' own maps while they were built.
 
     Raises:
         RecipeError: those were made under another condition.

@@ -1,6 +1,6 @@
 """A goal of the action `build_recipes`: a list of curvatures becomes recipes, stored with the calibration.
 
-Recipes that are whole are stored however the goal ends: on a failure of the bench or a cancel, those built before it.
+Complete recipes are stored however the goal ends: after a failure of the bench or a cancel, those built before it.
 The mirror goes back to mid range.
 """
 
@@ -27,10 +27,10 @@ from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import recipe_targets
 
-#: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.
+#: Longest wait for an answer of the calibration node, which stores recipes, and for that node to return, s.
 STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
-#: For the calibration node to judge the last map, half a second after its stamp, and to publish what it has shown, s.
+#: Time for the calibration node to judge the last map, half a second after its stamp, and to publish the result, s.
 JUDGED_S = 2.0
 
 
@@ -40,7 +40,7 @@ class RecipeRun:
     Args:
         bench: knows the calibration in use and the actuators' hysteresis; REACHABLE_TOLERANCE is among its parameters.
         store: client of the service `store_recipes`.
-        calibration: tells whether the node that serves it is alive.
+        calibration: liveliness of the node that serves it.
     """
 
     def __init__(self, bench: LoopBench, store: Client, calibration: Liveliness) -> None:
@@ -90,7 +90,7 @@ class RecipeRun:
             handle.publish_feedback(feedback)
 
         state, stands = bench.hysteresis(), bench.applied()
-        if state is None and stands is not None:  # as if it had long rested where the driver says that it stands
+        if state is None and stands is not None:  # as if long at rest where the driver reports it
             state = rested(planner.law, stands, bench.now(), active.middle)
         builder = RecipeBuilder(
             planner, bench, bench.now, options, state=state, on_step=report, cancelled=bench.cancelled
@@ -99,7 +99,7 @@ class RecipeRun:
         try:
             for target in targets:
                 builder.build(target)
-        except EXPECTED as error:  # a cancel as well; those that are whole stay
+        except EXPECTED as error:  # also a cancel; complete recipes are kept
             code, text = error_code(error), str(error)
         recipes, result.maps = builder.recipes, builder.maps
         rest = bench.rest(np.full(calibration.actuators, active.middle))
@@ -131,7 +131,7 @@ class RecipeRun:
         return code, "; ".join(filter(None, (text, figures, rest)))
 
     def _planner_now(self, active: ActiveCalibration) -> Planner:
-        """By the calibration of these recipes, into which their maps may have been taken meanwhile."""
+        """The planner of the calibration of these recipes, which may have taken in their maps meanwhile."""
         with suppress(Refusal):
             now = self._bench.active_calibration()
             if now.calibration.id == active.calibration.id:
@@ -139,7 +139,7 @@ class RecipeRun:
         return active.planner
 
     def _options(self, goal: Any) -> BuildOptions:
-        """What the goal asks for, 0 = configured."""
+        """The options of the goal, in which 0 = as configured."""
         values = self._values
         maps = goal.max_maps or values["recipes.max_maps"]
         # At least four rounds: without a model, hysteresis makes each correction miss by some share of itself.
@@ -150,10 +150,10 @@ class RecipeRun:
         )
 
     def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
-        """What the calibration node answers: an ErrorCode and a sentence.
+        """Ask the calibration node to store the recipes; returns its ErrorCode and sentence.
 
-        One that has died is waited for, and one that was started again until it has loaded its calibration. Where no
-        answer came it is asked again: one that has just been started loses answers to whom it does not know yet.
+        If it has died, its return is waited for; after a restart, until it has loaded its calibration. Without an
+        answer it is asked again: a node that has just started loses answers to clients that it has not discovered yet.
         """
         deadline = time.monotonic() + RETURN_S
         while True:
@@ -166,7 +166,7 @@ class RecipeRun:
             except ServiceCallError as error:
                 code, text = ErrorCode.TIMEOUT, gone() or str(error)
                 wait = True
-            lost = self._bench.hold.lost is not None  # somebody else wants the bench, which this does not need
+            lost = self._bench.hold.lost is not None  # somebody else has taken the mirror over: end the wait
             if not wait or lost or handle.is_cancel_requested or time.monotonic() > deadline:
                 return code, text
             self._bench.waiting(f"waiting: {text}")

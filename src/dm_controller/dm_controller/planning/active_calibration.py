@@ -22,14 +22,14 @@ from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
-#: Where none was heard of; it goes for the first moments of the node.
+#: Addition to the refusal while no calibration has been heard of, as in the first moments of the node.
 NOT_YET = "one that is in use already comes within seconds of this node's start"
-#: What to do where `hold_tilt` is true and cannot be.
+#: Warning where `hold_tilt` is true but the tilt cannot be held.
 NO_TILT = (
     "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
     "camera's picture moves with the focus; calibrate from maps that keep their tilt, or set hold_tilt = false"
 )
-#: How far the span of effective signals in a full cycle may be from that of the signals, as a share of it.
+#: Largest relative difference between the span of effective signals in a full cycle and that of the signals.
 SPAN_TOLERANCE = 0.5
 
 
@@ -40,7 +40,7 @@ class ActiveCalibration:
     Attributes:
         calibration: as received.
         mirror: its influence function inside the limits.
-        certain: the same inside what is within reach whatever the actuators remember.
+        certain: the same inside the limits that are within reach from any history.
         planner: of its moves.
         recipes: may be empty.
     """
@@ -61,12 +61,12 @@ class ActiveCalibration:
         return self.certain.reachable_range(target, tolerance)
 
     def degauss_steps(self, configured: int) -> int:
-        """Half-swings of the degauss that conditions: as `configured`, else as for the recipes; 0 = the driver's."""
+        """Half-swings of the conditioning degauss: `configured`, else as for the recipes; 0 = the driver's own."""
         return configured or (self.recipes.degauss_steps if self.recipes.recipes else 0)
 
     @cached_property
     def corrections(self) -> Corrections:
-        """What the recipes say of other shapes. Raises RecipeError when there are none."""
+        """The corrections that the recipes give for other shapes. Raises RecipeError when there are none."""
         return Corrections(self.recipes, self.planner, stamp_ns(self.calibration.checked) > self.recipes.stamp_ns)
 
     @property
@@ -75,10 +75,10 @@ class ActiveCalibration:
         return self.corrections.worst if self.recipes.recipes else 0.0
 
     def note_creep_shown(self, before: "ActiveCalibration | None", state: HysteresisState | None) -> None:
-        """Let bounds count creep from the last check on, as far as this takes in what maps have shown of it.
+        """Let bounds count creep only from the last check on, as far as this calibration includes what maps have shown.
 
         Args:
-            before: what was used until now; a check that it does not know was made at `state`.
+            before: the calibration used until now; a check that it does not include was made at `state`.
         """
         planner, last = self.planner, self.calibration.checked
         if (
@@ -114,7 +114,7 @@ def active_calibration(
 ) -> ActiveCalibration:
     """What to plan moves of `mirror` with; `hold_tilt` and `axis`: see `CalibratedMirror`.
 
-    `recipes` of another calibration do not count.
+    `recipes` of another calibration are ignored.
 
     Raises:
         Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
@@ -147,7 +147,7 @@ def active_calibration(
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         certain = calibrated
         if not planner.law.is_identity:
-            from dm_common.hysteresis.law_shape import certain_limits  # a start does not wait for it
+            from dm_common.hysteresis.law_shape import certain_limits  # not imported at the start
 
             certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -156,7 +156,7 @@ def active_calibration(
 
 
 def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Floats | None = None) -> InfluenceModel:
-    """The influence model of a dm_msgs/Calibration of a mirror whose actuators stand there, (N,) m.
+    """The influence model of a dm_msgs/Calibration of a mirror with actuators at these positions, (N,) m.
 
     Raises ValueError when its arrays do not fit together.
     """
@@ -193,7 +193,7 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         raise ValueError(f"hysteresis: {str(error).removeprefix('hysteresis: ')}") from error
     if law is None:
         return None
-    from dm_common.hysteresis.law_shape import slope_min, span  # a start does not wait for it
+    from dm_common.hysteresis.law_shape import slope_min, span  # not imported at the start
 
     slope = slope_min(law, limits.low, limits.high).min()
     if not slope > 0.0:

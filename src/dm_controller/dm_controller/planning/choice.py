@@ -1,4 +1,4 @@
-"""Which way to a shape, where there is a choice: at once from where the mirror stands, or after a degauss."""
+"""The choice between two ways to a shape: at once from the present state, or after a degauss."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -35,8 +35,8 @@ class PlanningContext(NamedTuple):
         active: calibration and mirror.
         estimate: the actuators now.
         now: s, ROS time.
-        settle: s after the way at which the shape is to be right.
-        degauss: that a move can begin with.
+        settle: s after the end of the move at which the shape is to be right.
+        degauss: the one that a move can begin with.
     """
 
     active: ActiveCalibration
@@ -60,7 +60,7 @@ def choose_move(target: FocusTarget, mode: str, budget: float, context: Planning
 
 
 def _unconditioned(target: FocusTarget, context: PlanningContext) -> Move:
-    """From where the mirror stands, or will stand after the degauss under way."""
+    """A move from the present state, or from that after the degauss under way."""
     if context.degauss.begun:
         return _after_degauss(target, context, None)
     estimate, planner = context.estimate, context.active.planner
@@ -98,7 +98,7 @@ def _best(target: FocusTarget, budget: float, context: PlanningContext) -> Move:
         if not 0.0 < degauss.wait <= budget:
             return ways[0]
         if not ways[0].known:
-            # Even where the model cannot say by how much, a mirror whose history is known repeats better.
+            # Even if the model cannot say by how much, a mirror with a known history repeats better.
             fresh = _after_degauss(target, context, None)
             if fresh.duration <= budget:
                 ways = [fresh]
@@ -107,8 +107,8 @@ def _best(target: FocusTarget, budget: float, context: PlanningContext) -> Move:
         if degauss.begun or recipe.duration <= budget:
             ways.append(recipe)
     except Refusal:
-        pass  # none serves: the other ways remain
-    # One way needs no prediction before its command.
+        pass  # no recipe serves: the other ways remain
+    # A single way needs no prediction before its command is sent.
     return ways[0] if len(ways) == 1 else min(ways, key=lambda way: way.plan.max_zernike_upper)
 
 
@@ -132,6 +132,6 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
 
 
 def unreachable(move: Move, active: ActiveCalibration, tolerance: float) -> Refusal:
-    """That the limits leave a larger coefficient error than `tolerance` (m), and what they permit."""
+    """The refusal of a shape in which the limits leave more error than `tolerance` (m), with what they permit."""
     reachable = active.reachable_range(move.target, tolerance)
     return Refusal(ErrorCode.UNREACHABLE, move.target.denied(move.max_zernike, tolerance, reachable))

@@ -1,4 +1,4 @@
-"""How far off a shape may be by creep that is not known: of the first second, of hours, and of what was held unseen."""
+"""Bounds of the error by creep that is not known: of the first second, over hours, and of shapes held unobserved."""
 
 from typing import NamedTuple
 
@@ -8,16 +8,16 @@ from dm_common import Floats
 from dm_common.hysteresis.creep_record import SLOW_S
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
-#: Ages of a shape that a bound holds for, s, beside the moment when it is to be right.
+#: Ages of a shape, s, for which a bound holds, besides the moment when it is to be right.
 AGES = (1.0, 10.0, 100.0)
-#: Time since which creep counts as in the figure of a calibration, s: half of a typical run.
+#: Time after `crept_at` to which the figure refers, including creep left then, s: half of a typical run.
 IN_FIGURE_S = 200.0
-#: 95 % quantile of one error, and of the largest of as many independent ones as a mirror has coefficients.
+#: 95 % quantile, in standard deviations, of one error, and of the largest of as many as a mirror has coefficients.
 ONE, LARGEST = 1.96, 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
-#: Share of creep that is known no better: of an element that the calibration says nothing of, by its time constant, s,
-#: below which and above which; and of what was held before the calibration.
+#: Relative error of creep that is not known better: of elements with time constants (s) below and above these two, if
+#: the calibration has no covariance, and of what was held before the calibration.
 UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, SLOW_S
 
 
@@ -27,7 +27,7 @@ class CreepBound(NamedTuple):
     Attributes:
         max_zernike: of the largest coefficient error beyond tilt.
         rms: of the rms sag error, piston and tilt removed.
-        unseen: whether most of the first is of what was held before the mirror was followed.
+        unseen: whether most of `max_zernike` comes from what was held before the mirror was followed.
     """
 
     max_zernike: float
@@ -36,13 +36,13 @@ class CreepBound(NamedTuple):
 
 
 class CreepShown(NamedTuple):
-    """Where creep stood when maps showed what it does to the figure.
+    """State of creep when maps showed its effect on the figure.
 
     Attributes:
         time: s.
-        crept: (N, J) effective signals that the elements had followed by then.
-        sigma: (J,) of what was held unseen, see :class:`~dm_common.hysteresis.model.HysteresisState`.
-        share: of what slow creep did by then that the figure takes in since.
+        crept: (N, J) states of the creep elements then.
+        sigma: (J,) `crept_sigma` then, see :class:`~dm_common.hysteresis.model.HysteresisState`.
+        share: of the slow creep until then, which the figure includes since.
     """
 
     time: float
@@ -52,14 +52,14 @@ class CreepShown(NamedTuple):
 
 
 class CreepError:
-    """Errors of creep of one mirror under one law.
+    """Errors by creep of one mirror under one law.
 
     Args:
         law: of N actuators.
         zernike: (K - 3, N) m per unit effective signal, coefficients beyond tilt.
-        sag_root: (N, N) m; its product with effective signals is as long as their rms sag.
+        sag_root: (N, N) m; the norm of its product with effective signals is their rms sag.
         whole: (N,) effective signals of a shape of the whole range.
-        shown: by check maps; None = the figure is that of the calibration.
+        shown: creep that check maps have shown; None = the figure is that of the calibration.
     """
 
     def __init__(
@@ -78,23 +78,23 @@ class CreepError:
         self._shown = shown or CreepShown(0.0, self._in_figure, np.zeros(len(law.creep_time)), 0.0)
         self._share = self._shown.share * (law.creep_time > SLOW_S)
         self._in_figure = self._in_figure + self._share * (self._shown.crept - self._in_figure)
-        # What a shape of the whole range held unseen would leave, by element.
+        # Effect of a shape of the whole range held unobserved, by element.
         share = np.atleast_2d(law.creep_share).mean(axis=0)
-        share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # what they follow of the signals
+        share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # of elements that follow the signals
         self._unseen = (rows @ whole)[:, None] * share
-        # What was held before the calibration fades for hours. A run of minutes shows of it how large it is, but hardly
-        # of which actuators: any may differ from what was found by a share of what they have in the mean.
+        # What was held before the calibration fades for hours. A run of minutes shows its size, but hardly which
+        # actuators it is in: each may deviate from what was found by a share of the rms over all.
         found = float(np.sqrt(np.mean(np.square(law.crept)))) if law.crept.size else 0.0
         self._old = UNKNOWN_SHARE * found * share
 
     def bound(self, state: HysteresisState, position: Floats, ahead: float, measured: bool = False) -> CreepBound:
-        """Of a move from `state` to the static effective signals `position` (N,), `ahead` s after it and at AGES.
+        """Bound of a move from `state` to static effective signals `position` (N,), `ahead` s after it and at AGES.
 
-        The largest of these, for a shape is corrected by the same law while it is held.
+        The largest of these, since a held shape is corrected by the same law.
 
         Args:
-            measured: the same shape was measured at ages within MEASURED_S, by a mirror without older creep (a recipe):
-                what differs from then counts.
+            measured: the same shape was measured at ages within MEASURED_S, on a mirror without older creep (a recipe):
+                only the difference from then counts.
         """
         ages = np.array([ahead, *(age for age in AGES if age > ahead)])
         faded = np.exp(-ages[:, None] / self._law.creep_time)  # (T, J)
@@ -107,7 +107,7 @@ class CreepError:
             features[:, :, 0] = 0.0
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
-        # One shape that all elements have followed, and which maps have shown in part; and what was held since.
+        # One unobserved shape that all elements have followed, shown by maps in part; and what was held since.
         time, shown = self._law.creep_time, self._shown
         same = np.minimum(shown.sigma * np.exp(-np.maximum(state.time - shown.time, 0.0) / time), state.crept_sigma)
         since = np.sqrt(np.square(state.crept_sigma) - np.square(same))
@@ -128,9 +128,9 @@ class CreepError:
         return CreepBound(float(np.sqrt(largest[worst])), ONE * float(np.sqrt(rms.max())), most)
 
     def drift(self, moved: HysteresisState, effective: Floats) -> tuple[float, float]:
-        """Largest coefficient and rms sag, m, at AGES of what creep does to a shape that nothing holds.
+        """Largest coefficient and rms sag, m, over AGES, of the creep of a shape that nothing corrects.
 
-        It should stand at `effective` (N,), and has just gone to the state `moved`.
+        It should be at `effective` (N,); the mirror has just moved to the state `moved`.
         """
         law = self._law
         gaps = [law.effective(law.advance(moved, moved.time + age)) - effective for age in AGES]
@@ -139,7 +139,7 @@ class CreepError:
 
 
 def _default_covariance(law: HysteresisModel) -> Floats:
-    """Covariances where the calibration holds none: its gains hold what fast elements follow at once."""
+    """Covariances if the calibration has none; its gains include what fast elements follow at once."""
     time = law.creep_time
     share = UNKNOWN_SHARE * np.atleast_2d(law.creep_share).mean(axis=0)
     rows = np.hstack((np.where(time < UNKNOWN_BELOW, -1.0, 0.0)[:, None], np.eye(len(time))))

@@ -1,11 +1,11 @@
-"""The quick way from a target to its command: what does not depend on the request is done before one comes.
+"""The fast path from a target to its command: what does not depend on the request is computed in advance.
 
-A mirror waits longer for a request than a request may wait for its command. Both halves give what the plain path gives,
-:meth:`CalibratedMirror.command` and :func:`dm_common.hysteresis.inverse.invert`, or say that the plain path has to
-be taken: where a series is too short, a piece not exact enough, or a limit is met. Together they make planning five
-times as quick.
+A mirror waits longer for a request than a request may wait for its command. Both halves give the result of the regular
+path, :meth:`CalibratedMirror.command` and :func:`dm_common.hysteresis.inverse.invert`, or report that it has to be
+taken: where a series is too short, a piece not exact enough, or a limit is met. Together they make planning five times
+as fast.
 
-As a short power series in the radius, all that is linear in the sag of a conic can be worked out once per mirror:
+With a short power series in the radius, all that is linear in the sag of a conic is computed once per mirror:
 
     z = c r^2 / (1 + sqrt(1 - q)) = c r^2 sum_j C_j / (2 4^j) q^j,   q = (1 + K) (c r)^2,   C_j the Catalan numbers
 
@@ -26,16 +26,16 @@ from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget, Shape
 
-#: Error of an effective signal from which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
-#: times below, the tables of Duhem operators reach half of it.
+#: Error of an effective signal above which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
+#: times below this; the tables of Duhem operators reach half of it.
 EXACT = 1e-5
-#: Distance of actuators on the common scale on which all places are looked up at once; effective signals span about 2.
+#: Offset between actuators on the axis on which all onsets are looked up at once; effective signals span about 2.
 APART = 1e3
-#: Powers of q that are kept.
+#: Number of powers of q that are kept.
 ORDERS = 4
-#: Signs of a falling and of a rising way, as `Pieces.polynomial` has them.
+#: Signs of falling and rising moves, in the order of `Pieces.polynomial`.
 WAYS = np.array([-1.0, 1.0])[:, None, None]
-#: Largest |q| at the rim for which the series is used: what is left out is below 14/512 q^4, 3e-18 of the whole.
+#: Largest |q| at the rim for which the series is used: the first term left out is 14/512 q^4 of c r^2, 3e-18.
 Q_MAX = 1e-4
 
 
@@ -101,9 +101,9 @@ class ClosedForm:
 class PreparedInverse:
     """The inverse of the hysteresis model from one state, at any time after it.
 
-    From the state that the driver reported follow, for either way and every actuator, the places where the play
-    operators set in and the law between them. There its inverse is smooth: a cubic that meets values and slopes at both
-    ends of a piece. What a request still needs is to look its pieces up and to sum three powers.
+    The state that the driver reported determines, for both directions and every actuator, the onsets of the play
+    operators and the law between them. Between onsets the inverse is smooth: a cubic that meets values and slopes at
+    both ends of a piece. A request then only needs to look its pieces up and to sum three powers.
 
     Args:
         law: one whose effective signals depend on the past.
@@ -124,13 +124,13 @@ class PreparedInverse:
         self._apart = state.signals - state.position
         self._rests: dict[float, tuple[Floats, Floats, Floats]] = {}
         parts = pieces(law)
-        # Without the signal itself there is a dead zone about the state, which no piece describes.
+        # Without the signal itself (half-width 0) there is a dead zone about the state, which no piece describes.
         self._serves = parts.radius[0] == 0.0
         if self._serves:
             self._prepare(parts)
 
     def _prepare(self, parts: Pieces) -> None:
-        """Pieces are counted way by way, falling first, then by actuator, then as operators set in."""
+        """Tabulate the pieces, ordered by direction (falling first), then by actuator, then by onset."""
         curve, count = parts.polynomial, len(self.state.signals)
         begin, first, steeper, waiting = parts.onsets(self.state, WAYS, curve)
         if len(curve) == 2 and parts.fading is None:
@@ -145,7 +145,7 @@ class PreparedInverse:
         self._places = (places + rows[:, None]).ravel()
 
     def _cubics(self, parts: Pieces, begin: Floats, first: Floats, steeper: Floats, waiting: Floats) -> Floats:
-        """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact.
+        """Rows of: onset, value there, and coefficients 1 to 3 of the inverse from there; NaN where it is not exact.
 
         Args:
             begin, first, steeper, waiting: as `Pieces.onsets` returns them.
@@ -163,7 +163,7 @@ class PreparedInverse:
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last
             square, cube = (3.0 * chord - 2.0 * one - two) / rise, (one + two - 2.0 * chord) / rise**2
-            # An error is largest in the middle.
+            # The error is evaluated in the middle, where it is largest.
             middle = 0.5 * rise
             way = ((cube * middle + square) * middle + one) * middle
             error = horner(curve, begin + way) + waiting - first - middle
@@ -172,7 +172,7 @@ class PreparedInverse:
         return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
 
     def invert(self, time: float, effective: Floats, ahead: float) -> Floats | None:
-        """Signals (N,) applied at `time` (s) for `effective` (N,) `ahead` s later; None = ask `invert`."""
+        """Signals (N,) applied at `time` (s) for `effective` (N,) `ahead` s later; None = use `inverse.invert`."""
         if not self._serves:
             return None
         faded, grown, followed = self._creep(time, ahead)
@@ -182,9 +182,9 @@ class PreparedInverse:
             signals = self._looked_up(wanted)
             before, apart = apart, signals - wanted
             last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
-            if not LAG_LEFT < left < last:  # as in `invert`; also where there is no number
+            if not LAG_LEFT < left < last:  # as in `invert`; also for NaN
                 break
-        # Not beyond an end by rounding either; where a piece is not exact there is no number.
+        # No rounding beyond an end; a piece that is not exact gives NaN, which fails here too.
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
         return np.asarray(signals) if inside and self._limits.allow_neighbours(signals) else None
 
@@ -198,7 +198,7 @@ class PreparedInverse:
         return np.asarray(piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise)
 
     def _creep(self, time: float, ahead: float) -> tuple[Floats, Floats, Floats]:
-        """As `HysteresisModel.creep_ahead` for the state at `time`, but what signals add is in both shares."""
+        """As `HysteresisModel.creep_ahead` for the state at `time`, but the second share includes the third."""
         elapsed = max(time - self.state.time, 0.0) + ahead
         known = self._rests.get(ahead)
         if known is None:

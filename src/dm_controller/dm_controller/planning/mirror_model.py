@@ -15,19 +15,19 @@ from dm_common.optics.conic import reachable_range
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
 
-#: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
+#: Weight of a coefficient relative to the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
 COEFFICIENT_WEIGHT = 100.0
-#: Combinations of coefficients that the actuators move less than this, relative to the one they move most, cannot be
-#: made equal to anything: with 19 actuators 3 of 18 stand below 2e-4, the others above 0.09; with 37 all above 0.1.
+#: Combinations of coefficients that actuators move less than this, relative to the best one, are not made equal: with
+#: 19 actuators 3 of 18 are below 2e-4, the others above 0.09; with 37 all are above 0.1.
 LEAST_AUTHORITY = 0.01
 #: Ridge on the signals, as a share of a typical actuator's rms response. On a simulated PDM30-37 it costs less than
 #: 1 % of the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
-#: The same where an actuator has no effect: else all others go where it stands, to the end of their range, to hide it.
+#: The same if an actuator has no effect: otherwise all others run to the end of their range on its side to hide it.
 RIDGE_SHARE_STUCK = 0.1
-#: How much more tilt counts than the sag beyond the terms, where it is held: less than the coefficients, so that where
-#: a limit binds the shape has precedence.
+#: Weight of held tilt relative to the sag beyond the terms: less than that of the coefficients, so that the shape has
+#: precedence where a limit binds.
 TILT_WEIGHT = 10.0
 #: Tilt at the edge, as a share of the largest response, below which maps do not show it; an actuator makes 1.5.
 LEAST_TILT = 0.05
@@ -35,7 +35,7 @@ LEAST_TILT = 0.05
 
 @dataclass(frozen=True)
 class InfluenceModel:
-    """What a calibration says of a mirror; see dm_msgs/Calibration for the fields.
+    """The description of a mirror by its calibration; see dm_msgs/Calibration for the fields.
 
     Shapes: N actuators, K Zernike terms, P sampling points.
 
@@ -82,7 +82,7 @@ class InfluenceModel:
 
 
 def response(model: InfluenceModel, change: Floats) -> Shape:
-    """What a change of effective signals (N,) does to the surface, as the model says."""
+    """Change of the surface, by the model, due to a change of effective signals (N,)."""
     return Shape(model.influence_zernike @ change, model.influence_sag @ change)
 
 
@@ -98,7 +98,7 @@ def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
 
 @dataclass(frozen=True)
 class Plan:
-    """A command and what it is expected to do.
+    """A command and its expected result.
 
     Lengths in m; `lower` and `upper` are 95 % bounds that include the calibration's held-out error.
     """
@@ -110,11 +110,11 @@ class Plan:
     max_zernike: float
     max_zernike_upper: float
     saturated: NDArray[np.bool_]
-    most: str = ""  # what most of the bound comes from, where that is much more than the calibration's own
+    most: str = ""  # main source of the bound, where that is much more than the calibration's own error
 
 
 def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
-    """95 % interval of an rms, m, when an independent error with the rms `spread` (m) comes on top, in squares."""
+    """95 % interval of an rms, m, when an independent error with the rms `spread` (m) is added in squares."""
     reach = (1.96 * spread) ** 2
     return math.sqrt(max(rms**2 - reach, 0.0)), math.sqrt(rms**2 + reach)
 
@@ -131,7 +131,7 @@ def coefficient_rows(influence: Floats) -> Floats:
     weak[: len(authority)] = authority < LEAST_AUTHORITY * authority[0]
     if not weak.any():
         return COEFFICIENT_WEIGHT * np.eye(len(influence))
-    # Without authority a unit is the rms sag it stands for, as in the rows of the sag below.
+    # Without authority a unit is the rms sag that it stands for, as in the sag rows below.
     rows: Floats = np.where(weak, 1.0, COEFFICIENT_WEIGHT)[:, None] * modes.T * rms
     return rows
 
@@ -146,27 +146,27 @@ def reduced(sag: Floats, weights: Floats, removed: Floats) -> Floats:
 class CalibratedMirror:
     """Solves focus targets on an influence model inside limits.
 
-    The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
-    possible, with piston free, inside the limits, and the tilt at what it is at zero signals, so that the picture of a
-    camera stands still while the focus changes (`hold_tilt`; else it is free too); a target's own tilt comes on top. A
-    camera whose axis meets the mirror beside the middle sees the slope that a sphere has there: as much tilt puts the
-    vertex on the axis. Where the limits forbid equality the command is the closest in the weighted least-squares sense.
-    A mirror of few actuators moves fewer combinations of coefficients than there are; the others count as the sag they
-    are (measured with 19 actuators: 8 nm rms are left instead of 97, and no signal saturates). A small ridge keeps
-    actuators that the aperture hardly sees from running to their limits for nothing.
+    The command makes the coefficients beyond tilt equal to the wanted ones, makes the sag beyond the terms as small as
+    possible, leaves piston free, and keeps all limits. With `hold_tilt` it keeps the tilt at its value at zero signals,
+    so that the picture of a camera stands still while the focus changes; otherwise tilt is free too. A target's own
+    tilt is added. A camera whose axis meets the mirror beside the middle sees the slope of a sphere there; the opposite
+    tilt puts the vertex on the axis. Where the limits forbid equality the command is the closest in the weighted
+    least-squares sense. A mirror of few actuators moves fewer combinations of coefficients than there are; the others
+    are weighted as the sag they are (measured with 19 actuators: 8 nm rms are left instead of 97, and no signal
+    saturates). A small ridge keeps actuators that the aperture hardly sees from running to their limits for nothing.
 
     Args:
         model: of the mirror.
         limits: of its signals.
-        hold_tilt: hold it where the model says where the actuators are, and its maps show their tilt.
+        hold_tilt: hold the tilt, if the model has the actuators' positions and its maps show their tilt.
         axis: (2,) m, x and y of where the camera's axis meets the mirror.
 
     Attributes:
         axis: as given.
         matrix: (R, N), `rows` of the influence function.
         tilt: (2, N) m per unit signal, of the two tilts that are held; None = they are free.
-        ridge: weight of the squared signals beside the squared rows.
-        sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
+        ridge: weight of the squared signals relative to the squared rows.
+        sag_root: (N, N), m: the norm of its product with signals is their rms sag, piston and tilt removed.
     """
 
     def __init__(
@@ -191,9 +191,9 @@ class CalibratedMirror:
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
     def rows(self, shape: Shape, tilt: Floats | None = None) -> Floats:
-        """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
+        """Rows of a surface in the programme: weighted coefficients beyond tilt, then weighted sag beyond the terms.
 
-        Where tilt is held, two rows above them are the wanted one, whatever tilt was measured.
+        If tilt is held, two rows for the wanted tilt come first, whatever tilt was measured.
 
         Args:
             shape: the surface, or one in each column.
@@ -259,7 +259,7 @@ class CalibratedMirror:
         )
 
     def wanted(self, target: FocusTarget) -> tuple[Shape, Floats]:
-        """The surface of `target` less that at zero signals; and its own tilt less its sphere's on the axis, (2,) m.
+        """The surface of `target` minus that at zero signals; its tilt minus that of its sphere on the axis, (2,) m.
 
         Raises:
             TargetError: no such surface exists over the aperture.

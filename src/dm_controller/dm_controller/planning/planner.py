@@ -1,8 +1,8 @@
-"""From a target and the state of the actuators to a command, with what it is expected to do.
+"""From a target and the state of the actuators to a command, with its expected result.
 
-The influence function acts on effective signals; the bounded programme finds those of the target, the inverse of the
-hysteresis model the signals that bring them about from where the mirror stands. Holding the shape is the same inversion
-again, a little later: creep has changed what the same signals do.
+The influence function acts on effective signals. The bounded programme finds those of the target; the inverse of the
+hysteresis model finds the signals that produce them from the present state. Holding a shape is the same inversion a
+little later, since creep has changed the effect of the same signals.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from dm_controller.planning.target import FocusTarget
 if TYPE_CHECKING:
     from dm_controller.planning.creep_error import CreepBound, CreepError, CreepShown
 
-#: When a shape is to be right unless configured otherwise, s after the way.
+#: Time at which a shape is to be right unless configured otherwise, s after the end of the move.
 SETTLE_S = 0.05
 #: Draws for the 95 % quantile of the largest of many errors.
 DRAWS = 4000
-#: Largest coefficient error of what counts as within the range of the mirror, m.
+#: Largest coefficient error of a sphere that counts as within the range of the mirror, m.
 RANGE_TOLERANCE = 20e-9
-#: Effective signals that a limit denies count from here on, normalised.
+#: Error of an effective signal, normalised, above which a limit counts as binding.
 MISSED_MAX = 1e-6
-#: A bound of creep so many times that of all else is named.
+#: Factor by which the bound of creep must exceed that of all other errors for creep to be named as its main source.
 MUCH = 2.0
 
 
@@ -56,7 +56,7 @@ class Move:
     Attributes:
         target: the wanted surface.
         signals: (N,) what the electronics get.
-        effective: (N,) effective signals aimed at: what holding the shape means.
+        effective: (N,) effective signals aimed at, which holding the shape keeps.
         max_zernike: m, expected largest coefficient error.
         known: whether the state that it begins from can be trusted.
         duration: s until the shape is right.
@@ -77,7 +77,7 @@ class Move:
 
     @cached_property
     def plan(self) -> Plan:
-        """Command and prediction, worked out when first asked for: a command need not wait for it."""
+        """Command and prediction, computed when first asked for: a command need not wait for it."""
         return self._predict()
 
     @cached_property
@@ -91,7 +91,7 @@ class Planner:
 
     Args:
         mirror: its influence function acts on effective signals.
-        hysteresis: None = it is not identified: effective signals are signals.
+        hysteresis: None = not identified: effective signals are signals.
         slew_rate: of the signals, 1/s; infinite = moves take no time.
     """
 
@@ -104,7 +104,7 @@ class Planner:
         self._closed_form = ClosedForm(mirror)
         self._prepared: PreparedInverse | None = None
         self._limits = within(mirror.limits) if hysteresis is not None else mirror.limits
-        #: By check maps that the figure takes in.
+        #: Creep that check maps have shown and that the figure includes.
         self.creep_shown: CreepShown | None = None
 
     @cached_property
@@ -112,7 +112,7 @@ class Planner:
         return ConstrainedInverse(self.law, self._limits, self.mirror.matrix, self.mirror.ridge)
 
     def prepare(self, state: HysteresisState) -> None:
-        """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
+        """Compute in advance what plans from exactly this `state`, of a mirror at rest, will need."""
         ready = self._prepared
         if self.hysteresis is not None and self.law.has_history and (ready is None or ready.state is not state):
             self._prepared = PreparedInverse(self.law, state, self._limits)
@@ -130,10 +130,10 @@ class Planner:
         """The move to `target` that begins at `time` (s) from `state`.
 
         Args:
-            state: None = unknown altogether; then the mirror is taken to be degaussed, after shapes that nobody saw.
+            state: None = entirely unknown; the mirror is then taken to be degaussed, after shapes held unobserved.
             known: whether the state can be trusted; if not, the bounds are widened.
             effective: (N,) effective signals to aim at instead of the model's own (a recipe).
-            ahead: s after the way at which the shape is to be right; creep is quickest just after a move.
+            ahead: s after the end of the move at which the shape is to be right; creep is quickest just after a move.
             error: m, 95 % bound of the largest coefficient error under `effective`, where it was measured.
 
         Raises:
@@ -144,7 +144,7 @@ class Planner:
         if effective is None:
             found = self._closed_form.find(target)
             aim, largest = found or mirror.command(target)
-            # By limits that are the signals' and not theirs: from here the signals may reach further, or less far.
+            # The limits are those of signals, not of effective ones: from this state more or less may be in reach.
             cut = found is None and bool(mirror.limits.at_limit(aim).any())
         else:
             aim, largest = effective, mirror.predict(target, effective).max_zernike
@@ -155,7 +155,7 @@ class Planner:
             state = rested(law, np.full(len(aim), middle), time, middle)
         else:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
-        # A move counts from its last write; older creep goes on during the way.
+        # A move's creep counts from its last write; older creep goes on during the move.
         begun, arrival = state, time + travel
         signals, missed = aim, None
         if self.hysteresis is not None or effective is not None:
@@ -196,10 +196,10 @@ class Planner:
         target: FocusTarget | None,
         cut: bool = False,
     ) -> tuple[Floats, Floats | None]:
-        """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing.
+        """Signals (N,) for the effective signals `aim`, and what these miss because of limits; None = nothing.
 
-        Where the limits bind, or have `cut` the aim, the signals are the nearest to `target`, or to the shape of `aim`
-        without one.
+        Where the limits bind, or have `cut` the aim, the signals are those nearest to `target`, or without one to the
+        shape of `aim`.
         """
         limits, ready = self._limits, self._prepared
         if ready is not None and ready.state is state and not cut:
@@ -219,7 +219,7 @@ class Planner:
         return self._inverted(state, time, effective, ahead, None)[0]
 
     def drift(self, state: HysteresisState, time: float, effective: Floats) -> float:
-        """Largest coefficient error (m) at `time` (s) of a mirror that should stand at `effective` (N,)."""
+        """Largest coefficient error (m) at `time` (s) of a mirror that should be at `effective` (N,)."""
         gap = self.law.effective(self.law.advance(state, time)) - effective
         return self._largest(gap)
 
@@ -228,14 +228,14 @@ class Planner:
         return float(np.abs(self._zernike @ effective).max())
 
     def note_creep_shown(self, state: HysteresisState, share: float) -> None:
-        """Count this `share` of what slow creep had done by the time of `state` as in the figure; before any plan."""
+        """Count this `share` of the slow creep until the time of `state` as in the figure; call it before any plan."""
         from dm_controller.planning.creep_error import CreepShown  # a command does not wait for it
 
         self.creep_shown = CreepShown(state.time, state.crept, state.crept_sigma, share)
 
     @cached_property
     def _whole(self) -> Floats:
-        """(N,) effective signals of a sphere as large as the mirror takes, of the sign that it takes further."""
+        """(N,) effective signals of the strongest sphere within reach, of the sign that reaches further."""
         sphere = FocusTarget(0.0)
         ends = self.mirror.reachable_range(sphere, RANGE_TOLERANCE)
         far = max((end for end in ends if math.isfinite(end)), key=abs, default=0.0)
@@ -248,10 +248,10 @@ class Planner:
         return CreepError(self.law, self._zernike, self.mirror.sag_root, self._whole, self.creep_shown)
 
     def error_bound(self, known: bool, error: float | None = None) -> float:
-        """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not.
+        """m, 95 % bound of the largest coefficient error without creep, with the history `known` or not.
 
         Args:
-            error: the same of this shape with a known history, m; None = as of any.
+            error: the bound for this shape with a known history, m; None = that for any shape.
         """
         if error is None:
             found, model = self.hysteresis, self.mirror.model
@@ -283,7 +283,7 @@ class Planner:
     def _unknown_history(self) -> tuple[float, float]:
         """95 % bound of the largest coefficient error, and rms sag error, when the history is not known; m.
 
-        The larger of those of actuators that err each by itself, and all as one: a focus moves them together.
+        The larger of two cases: each actuator errs independently, or all together, as a focus moves them.
         """
         if self.hysteresis is None:
             return 0.0, 0.0

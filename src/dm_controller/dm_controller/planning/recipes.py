@@ -1,10 +1,10 @@
-"""What recipes say of a shape: what the model misses there, and how far that can be trusted.
+"""Corrections that recipes give for a shape: what the model misses there, and how reliable they are.
 
 A recipe shows what the model's own effective signals miss of one shape. Shapes nearby miss about the same: the
 corrections are samples of a field over effective signals whose differences grow with the root of the distance, as those
-of a random walk do, and its best linear estimate (kriging: Matheron 1963; Gaussian process regression with the
-exponential covariance) serves every shape near recipes, of whatever kind. How large the field is follows from what the
-model promises and from what the recipes show: their corrections, and what is missed of each when it is left out.
+of a random walk do. Its best linear estimate (kriging: Matheron 1963; Gaussian process regression with the exponential
+covariance) serves every shape near recipes, of whatever kind. The size of the field follows from the error that the
+model promises, and from the recipes: their corrections, and the error of predicting each from the others.
 """
 
 import math
@@ -22,33 +22,33 @@ from dm_common.recipes import Recipe, RecipeBook, RecipeError, shape_text, terms
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import TARGET, FocusTarget, Shape
 
-#: Surfaces whose coefficients differ less are the same shape, m.
+#: Surfaces whose coefficients differ by less than this are the same shape, m.
 SAME_SHAPE = 3e-12
 #: Tilt at the edge, m, that recipes may have beyond what is wanted: a few tenths of a camera's pixel.
 SAME_TILT = 20e-9
-#: Effective signals that differ less are the same: a third of a DAC step.
+#: Effective signals that differ by less than this are the same: a third of a DAC step.
 SAME_SIGNALS = 1e-5
-#: Distance of effective signals, rms over actuators, at which corrections are alike to 1/e. A sphere of 0.05 1/m and
-#: mid range are about 0.5 apart.
+#: Correlation length: distance of effective signals, rms over actuators, at which the correlation of corrections is
+#: 1/e. A sphere of 0.05 1/m and mid range are about 0.5 apart.
 REACH = 1.0
 #: Variance of a recipe's own error, as a share of the field's.
 NUGGET = 1e-3
-#: Where recipes leave more of the variance than this they say nothing of a shape.
+#: Largest share of the variance that recipes may leave; above it they do not serve a shape.
 LEFT_MAX = 0.5
-#: By how much a conditioned shape does not repeat, as a share of the model's error on held-out moves.
+#: Error of repeating a conditioned shape, as a share of the model's error on held-out moves.
 REPEAT_SHARE = 0.3
-#: Recipes whose weight is less, as a share of the largest, do not count for what was measured nearby.
+#: Recipes with weights below this share of the largest do not count as measured nearby.
 SLIGHT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class FoundRecipe:
-    """What makes a shape from the conditioned mirror.
+    """The effective signals for a shape from the conditioned mirror.
 
     Attributes:
         effective: (N,) effective signals.
-        error: m, bound of the largest coefficient error but for creep: as re-measured at the recipes that it rests on,
-            and what the correction may have changed by since the nearest of them.
+        error: m, bound of the largest coefficient error without creep: as re-measured at the recipes used, plus the
+            possible change of the correction away from them.
     """
 
     effective: Floats
@@ -68,13 +68,13 @@ class Kriging:
         self._inverse = np.linalg.inv(_alike(places[:, None], places) + np.diag(noise))
 
     def at(self, place: Floats) -> tuple[Floats, float]:
-        """Weights (R,) of the samples at `place` (N,), and the variance that they leave."""
+        """Weights (R,) of the samples at `place` (N,), and the variance that remains."""
         alike = _alike(place, self._places)
         weights = alike @ self._inverse
         return weights, max(1.0 - float(weights @ alike), 0.0)
 
     def left_out(self, values: Floats) -> tuple[Floats, Floats]:
-        """What the others miss of each sample of `values` (R, N), and (R,) the variance that they leave there."""
+        """Error of predicting each sample of `values` (R, N) from the others, and (R,) the variance that remains."""
         left = 1.0 / np.diag(self._inverse)
         return left[:, None] * (self._inverse @ values), left
 
@@ -88,15 +88,15 @@ class Corrections:
     """The corrections that the recipes of `book` show on the mirror of `planner`.
 
     Args:
-        learnt: maps have agreed with the calibration since the recipes were built: what it gives otherwise since then
-            moves them too. Without such maps they stand as they were measured, also where updates of before are lost.
+        learnt: whether maps have agreed with the calibration since the recipes were built: its changes since then shift
+            them too. Otherwise they stay as they were measured, even where earlier updates are lost.
 
     Raises:
         RecipeError: there are none.
-        Refusal: one is of no shape, naming its field.
+        Refusal: one has an invalid shape, naming its field.
 
     Attributes:
-        amplitude: m, bound of the largest coefficient that a correction makes where no recipe is near.
+        amplitude: m, bound of the largest coefficient of a correction where no recipe is near.
     """
 
     def __init__(self, book: RecipeBook, planner: Planner, learnt: bool = False) -> None:
@@ -117,18 +117,18 @@ class Corrections:
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
         missed, left = self._kriging.left_out(self._corrections)
-        # Alone, a recipe is missed by its whole correction; what was re-measured counts by itself.
+        # A single recipe is missed by its whole correction; the re-measured error is counted separately.
         beyond = np.maximum(self._largest(missed) - self._measured.max(), 0.0) / np.sqrt(left)
         hysteresis, model = planner.hysteresis, planner.mirror.model
         held_out = model.held_out_max_zernike if hysteresis is None else hysteresis.held_out_max_zernike
         shown = max(float(self._largest(self._corrections).max()), float(beyond.max()))
-        # The largest of a few samples is not the largest there is.
+        # The largest of a few samples underestimates the largest there is.
         self.amplitude = max(planner.error_bound(known=True), shown * (1.0 + 2.0 / len(recipes)))
         self._repeat = REPEAT_SHARE * held_out
 
     def _other_tilt(self, own: Floats) -> Floats:
-        """(R, N) effective signals of the tilt in what recipes added to the model's `own` (R, N), where it is none that
-        corrections bring along, nor that a limit has cut: they were built for another axis, or while tilt was free.
+        """(R, N) effective signals of the tilt that recipes added to the model's `own` (R, N), unless corrections bring
+        it along or a limit has cut it: such recipes were built for another axis, or while tilt was free.
         """
         mirror, count = self._mirror, len(own)
         if mirror.tilt is None:
@@ -144,7 +144,7 @@ class Corrections:
         return target.coefficients(self._mirror.model.aperture_radius)[PISTON_TILT:]
 
     def _bound(self, measured: float, left: float) -> float:
-        """m, for shapes near recipes that were re-measured with that error (m), which leave that variance."""
+        """m, for shapes near recipes with the re-measured error `measured` (m), which leave the variance `left`."""
         return measured + math.hypot(self.amplitude * math.sqrt(left), self._repeat)
 
     def _largest(self, effective: Floats) -> Floats:
@@ -153,10 +153,10 @@ class Corrections:
         return np.asarray(np.abs(effective @ influence.T).max(axis=1))
 
     def find(self, target: FocusTarget) -> FoundRecipe:
-        """What makes `target`, its tilt by the model: no map measures that.
+        """The effective signals for `target`; its tilt is the model's, since no map measures that.
 
         Raises:
-            RecipeError: it is beyond all curvatures there are, or no recipe is near.
+            RecipeError: it is beyond the curvatures of all recipes, or no recipe is near.
         """
         own, apart = self._mirror.command(target)[0], np.abs(self._surfaces - self._surface(target)).max(axis=1)
         if (same := np.flatnonzero(apart <= SAME_SHAPE)).size:
@@ -202,7 +202,7 @@ class Corrections:
 
 
 class UnreachableError(CodedError, RecipeError):
-    """The limits of the actuators deny the shape."""
+    """The limits of the actuators do not allow the shape."""
 
     error_code = ErrorCode.UNREACHABLE
 

@@ -23,13 +23,13 @@ class TargetError(Refusal):
 
 
 MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
-#: Far beyond any mirror, and all that follows from them stays finite.
+#: Limits far beyond any mirror, which keep all that is computed from them finite.
 _TARGET = {
     "curvature": real(0.0, -1e6, 1e6, "1/m"),
     "conic_constant": real(0.0, -1e9, 1e9),
     "zernike": reals([], -1.0, 1.0, "m", sizes=(0, len(TERMS))),
 }
-#: What fields may be that a target is made of: those of a request, and those that it has itself.
+#: Allowed values of the fields of a target: in a request, and in the target itself.
 REQUEST = Fields(
     {
         "mode": text("", choices=("", *MODES)),
@@ -77,7 +77,7 @@ class FocusTarget:
         conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 in [1]).
         zernike: added sag [m], Born & Wolf terms in the order of [1] over the working aperture; empty = none.
 
-    Whoever takes these from elsewhere holds them against `TARGET` or `REQUEST` first.
+    Values from outside have to be checked against `TARGET` or `REQUEST` first.
     """
 
     curvature: float
@@ -116,7 +116,7 @@ class FocusTarget:
         return float(np.abs(difference[PISTON_TILT:]).max())
 
     def denied(self, error: float, allowed: float, reachable: tuple[float, float]) -> str:
-        """That limits deny it, as a sentence.
+        """Say that limits do not allow the target, as a sentence.
 
         Args:
             error: largest coefficient error that they leave, m.

@@ -75,7 +75,7 @@ class Solver(ABC):
         """Prepare for a mirror.
 
         Raises:
-            ValueError: a model that the method cannot work on, in words.
+            ValueError: the method cannot work on the model; the message says why.
         """
         self.model = model
         self.limits = limits
@@ -150,10 +150,10 @@ def normalised_terms(model: InfluenceModel) -> tuple[Floats, Floats]:
 
 
 def miss_rows(matrix: Floats) -> Floats:
-    """(N, N) rows that make least squares shun moves whose miss would cost more than they mend.
+    """(N, N) rows that keep least squares from moves whose miss would cost more than they gain.
 
     When each actuator misses its move Δs_i by an independent share of MISS, the expected squared error of min|MΔs - b|²
-    grows by MISS² Σ |M_i|² Δs_i², M_i the columns: rows MISS |M_i| under M. Without them a correction chases sag that
-    only large, opposed moves of neighbours can mend, and their misses disturb the low orders by more than was won.
+    grows by MISS² Σ |M_i|² Δs_i², M_i the columns: rows MISS |M_i| under M. Without them a correction pursues sag that
+    only large, opposed moves of neighbours can correct, and their misses disturb the low orders by more than is gained.
     """
     return np.diag(MISS * np.linalg.norm(matrix, axis=0))

@@ -23,9 +23,9 @@ TINY = 1e-12
 class PseudoInverse(Solver):
     """Δs = G⁺ Δc by singular value decomposition ([1], introduction, its reference 18).
 
-    The shortest of all signals that give the wanted coefficients beyond tilt. Nothing holds it inside the range
-    ("severe overflow of the control voltage", section 1), so it is clipped and reports by how much; and nothing holds
-    down the sag beyond the terms.
+    The shortest of all signals that give the wanted coefficients beyond tilt. It is not kept inside the range ("severe
+    overflow of the control voltage", section 1), so it is clipped and reports by how much; the sag beyond the terms is
+    not minimised.
     """
 
     name = "pseudo_inverse"
@@ -54,10 +54,10 @@ class AZreg(PseudoInverse):
 class IterativeLearning(PseudoInverse):
     """s_{k+1} = s_k + L e_k, L = (GᵀG + β)⁻¹Gᵀ (iterative learning control, references 12 and 13 of [1]).
 
-    [1] names the method, its about three iterations and what β does ("by decreasing β, we increase the convergence
-    speed", section 2.2), but no formula. Norm-optimal learning, min ‖e - GΔs‖² + β‖Δs‖² in each repetition [12], is the
-    form of it in which a β does just that. Between steepest descent (large β) and the pseudo-inverse (β = 0): weak
-    modes are learned over several maps, so that noise and a wrong G disturb them less.
+    [1] names the method, its about three iterations and the effect of β ("by decreasing β, we increase the convergence
+    speed", section 2.2), but gives no formula. Norm-optimal learning, min ‖e - GΔs‖² + β‖Δs‖² in each repetition [12],
+    is the form in which a β has just that effect. It lies between steepest descent (large β) and the pseudo-inverse
+    (β = 0): weak modes are learned over several maps, so that noise and a wrong G disturb them less.
     """
 
     name = "iterative_learning"
@@ -76,7 +76,7 @@ class AZWreg(Solver):
     On the coefficient vector W would cancel or act on coefficients, not regions; on the sag points, which outnumber
     the actuators, a smaller weight lets a region keep more of the error. Piston and tilt are free: three columns of
     their own in the weighted problem. Least squares as in Eq. (7), so the result is clipped and reports the overflow.
-    Corrections also weigh what actuators miss of their moves, see `miss_rows`.
+    Corrections also weigh the expected misses of the actuators, see `miss_rows`.
     """
 
     name = "AZWreg"
@@ -101,7 +101,7 @@ class AZWreg(Solver):
         return start + step
 
     def _corrected(self, signals: Floats, error: Shape) -> Floats:
-        """With moves priced by what the actuators miss of them."""
+        """Weighs moves by the expected misses of the actuators."""
         better: Floats = signals - self._correction @ reduced(error.sag, self._row, self._plane)
         return better
 
@@ -110,30 +110,30 @@ class Bounded(Solver):
     """Least squares inside the box ([9], chapter 23): `CalibratedMirror` for shapes and corrections of any kind.
 
     The coefficients beyond tilt weigh so much that they act as equalities, the sag beyond the 21 terms is as small as
-    possible, and the limits hold by construction: nothing is ever clipped. Corrections also weigh what
-    actuators miss of their moves, see `miss_rows`.
+    possible, and the limits hold by construction: nothing is ever clipped. Corrections also weigh the expected misses
+    of the actuators, see `miss_rows`.
     """
 
     name = "bounded"
 
     def __init__(self, model: InfluenceModel, limits: Limits, mirror: CalibratedMirror | None = None) -> None:
-        """`mirror`: of that model and those limits, which knows whether tilt is held and about which axis."""
+        """`mirror`: for that model and those limits; it knows whether tilt is held and about which axis."""
         super().__init__(model, limits)
         self._mirror = mirror or CalibratedMirror(model, limits)
-        # A correction must not pull at signals that the error says nothing of: its rows price moves, not signals.
+        # A correction must not change signals on which the error has no bearing: its rows weigh moves, not signals.
         self._miss = miss_rows(self._mirror.matrix)
         self._correction = BoundedProgramme(np.vstack([self._mirror.matrix, self._miss]), limits, ridge=TINY**2)
 
     def command(self, target: FocusTarget) -> Command:
-        """With the tilt that the target wants; corrections leave the tilt as it is."""
+        """Includes the tilt of the target; corrections leave the tilt as it is."""
         return Command(self._mirror.command(target)[0])
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        # The programme bounds the signals themselves, so a change is asked for as the surface it leads to.
+        # The programme bounds the signals themselves, so a change is expressed as the surface it leads to.
         mirror = self._mirror
         return mirror.solve(mirror.matrix @ start + mirror.rows(change))
 
     def _corrected(self, signals: Floats, error: Shape) -> Floats:
-        """With moves priced by what the actuators miss of them."""
+        """Weighs moves by the expected misses of the actuators."""
         wanted = self._mirror.matrix @ signals - self._mirror.rows(error)
         return self._correction.solve(np.concatenate([wanted, self._miss @ signals]))

@@ -46,7 +46,7 @@ def make_solver(
 
     Raises:
         UnknownNameError: no such method, listing all.
-        ValueError: the model does not do for the method.
+        ValueError: the model does not suit the method.
     """
     solver = SOLVERS[named(name, SOLVERS)]
     if solver is Bounded:

@@ -1,4 +1,4 @@
-"""What every command passes on its way to the writer: is the driver configured, who holds the mirror. Knows no ROS."""
+"""Checks that every command passes before the writer: driver configured, mirror not held. Knows no ROS."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -24,14 +24,14 @@ CODE_OF_OUTCOME = {
 
 
 class CommandGate:
-    """Carries out what may be carried out, and keeps what was refused last.
+    """Carries out the commands that are permitted, and keeps the last refusal.
 
     Args:
         hold: who holds the mirror.
         report: called with a line for the log after each refusal, and, with True, when the mirror was taken over.
 
     Attributes:
-        writer, configuration: of the configured driver; None = it is not.
+        writer, configuration: of the configured driver; None = it is not configured.
         refusal: of the last command, or of the configuration; None = it was carried out.
         trouble: why the configuration was refused; "" = it was not.
         refused: number of refused commands by the name of their code.
@@ -52,12 +52,12 @@ class CommandGate:
         carry_out: Callable[[ActuatorWriter, DriverConfiguration], Result],
         dry_run: bool = False,
     ) -> Result | Refusal:
-        """Carry out a request, or return and report its refusal. A refused dry run is the caller's business only.
+        """Carry out a request, or return and report its refusal; a refused dry run is not reported.
 
         Args:
-            source: what the request came by, for the log.
+            source: where the request came from, for the log.
             request: its fields `holder` and `take_over` are judged here.
-            carry_out: returns what has begun to move; None = nothing has, and whoever holds the mirror keeps it.
+            carry_out: returns what has begun to move; None = nothing has, and the holder keeps the mirror.
         """
         writer, configuration = self.writer, self.configuration
         if not dry_run:

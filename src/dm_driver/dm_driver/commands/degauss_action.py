@@ -17,12 +17,12 @@ from dm_driver.degauss import degauss_move
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Move, Outcome
 
-#: How often a degauss is looked after, s, and how often its feedback is published.
+#: How often the state of a degauss is checked, s, and how often its feedback is published, s.
 POLL_S, FEEDBACK_S = 0.02, 0.1
 
 
 class DegaussAction:
-    """Serves `degauss` in worker threads; the newest goal that may be pre-empts, a cancelled one slews back.
+    """Serves `degauss` in worker threads; the newest permitted goal pre-empts, a cancelled one slews back.
 
     Args:
         node: hosts the action.
@@ -35,7 +35,7 @@ class DegaussAction:
         self._server = WorkerActionServer(node, Degauss, "degauss", self._run, exclusive="preempt", admit=self._admit)
 
     def _move(self, goal: Any, configuration: DriverConfiguration) -> Move:
-        """The move that a goal asks for. Raises Refusal where it may not be."""
+        """The move that a goal asks for. Raises Refusal if it is not allowed."""
         limits = configuration.limiter.limits
         middle = np.full(limits.actuators, limits.middle)
         end = configuration.limiter.check_shape(goal.end_signals or middle, "end_signals")
@@ -44,7 +44,7 @@ class DegaussAction:
         return degauss_move(limits, goal.amplitude, steps, end, self._values["degauss.duration_max"], name)
 
     def _admit(self, goal: Any) -> None:
-        """Raise the Refusal, which the gate logs, of a goal that may not be: it must not end the one that runs."""
+        """Raise the Refusal, logged by the gate, of a goal that is not allowed: it must not end the running one."""
 
         def judge(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
             self._move(goal, configuration)
@@ -99,9 +99,9 @@ class DegaussAction:
         return "succeed", ErrorCode.OK, swings if move.wipes else swings + too_little
 
     def _slew_back(self, writer: ActuatorWriter, move: Move, holder: str) -> str:
-        """Leave a degauss for the shape that the mirror held before; for none where the mirror is somebody else's now.
+        """Abandon a degauss for the shape held before; if somebody else has the mirror now, only halt.
 
-        Returns what became of it; "" = the degauss had ended by itself.
+        Returns the outcome as text; "" = the degauss had ended by itself.
         """
         lost = ""
         try:

@@ -1,8 +1,8 @@
-"""One owner of the mirror at a time: who holds it, and what everybody else hears meanwhile. Knows no node.
+"""One holder of the mirror at a time: who it is, and what everybody else is told meanwhile. Knows no node.
 
-A calibration that a stray focus request moves the mirror under is lost. So whoever needs the mirror for a while holds
+A calibration is lost if a stray focus request moves the mirror meanwhile. So whoever needs the mirror for a while holds
 it: commands of others are refused, with a sentence that says who holds it, for how long, and how to end that. A hold is
-renewed all the time and ends soon after its holder has died. Taking it over is explicit.
+renewed regularly and ends soon after its holder has died. Taking it over needs an explicit request.
 """
 
 import threading
@@ -13,24 +13,24 @@ from dm_msgs.srv import HoldMirror
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.values import real, text
 
-#: A hold that is not renewed ends after this time, s, where its holder names no other.
+#: A hold that is not renewed ends after this time, s, unless its holder asked for another lease.
 LEASE_S = 3.0
 #: Longest lease that may be asked for, s.
 LEASE_MAX_S = 3600.0
-#: Holders whose hold was taken over that are remembered.
+#: Number of holders that are remembered after their hold was taken over.
 EVICTED_KEPT = 100
 
-#: What may be asked, as its constants HOLD, RENEW, TAKE_OVER and RELEASE.
+#: Allowed operations: the constants HOLD, RENEW, TAKE_OVER and RELEASE.
 Operation = HoldMirror.Request
 _OPERATION = text("", choices=("", Operation.HOLD, Operation.RENEW, Operation.TAKE_OVER, Operation.RELEASE))
 _DURATION = real(0.0, 0.0, 1e9, "s")
 _LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
-#: Of `holder` and `purpose`, which stand in every refusal and state.
+#: Constraints on `holder` and `purpose`, which appear in every refusal and state.
 TEXT = text("")
 
 
 class MirrorHold:
-    """Any thread may ask.
+    """The hold of one mirror; may be used from any thread.
 
     Args:
         clock: steady time, s.
@@ -39,7 +39,7 @@ class MirrorHold:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._lock = threading.RLock()
-        # The holder stays until somebody else moves the mirror, also when the lease has run out: see `holder`.
+        # After its lease has run out, the holder is kept until somebody else moves the mirror: see `holder`.
         self._holder = self._purpose = ""
         self._since = self._until = self._duration = self._lease = 0.0
         self._evicted: dict[str, str] = {}  # whose hold was taken over and by whom, until they hold it again
@@ -65,7 +65,7 @@ class MirrorHold:
         """Hold the mirror, or give it back, as in dm_msgs/HoldMirror.
 
         Raises:
-            Refusal: BUSY, PREEMPTED when the hold to be renewed was taken over, or a field that cannot be.
+            Refusal: BUSY, PREEMPTED when the hold to be renewed was taken over, or a field that is not allowed.
         """
         _OPERATION.check("operation", operation)
         if not holder.strip():
@@ -86,11 +86,11 @@ class MirrorHold:
                 if holder == self._holder:
                     self._holder = ""
                 return
-            again = operation == Operation.RENEW and holder == self._holder  # lapsed or not: nobody came between
+            again = operation == Operation.RENEW and holder == self._holder  # even if lapsed, when nobody came between
             self._evict(holder, holder)
             self._evicted.pop(holder, None)
             now = self._clock()
-            if again:  # what it does not say anew stays
+            if again:  # empty arguments leave the values as they are
                 purpose, duration, lease = purpose or self._purpose, duration or self._duration, lease or self._lease
             elif current != holder:
                 self._since = now
@@ -98,10 +98,10 @@ class MirrorHold:
             self._until = now + self._lease
 
     def check(self, holder: str, take_over: bool) -> bool:
-        """Whether a command of `holder` ("" = nobody in particular) takes the mirror from somebody.
+        """Whether a command of `holder` ("" = nobody in particular) takes the mirror from another holder.
 
         Raises:
-            Refusal: BUSY, somebody else holds the mirror; PREEMPTED, they lost it and have not held it again.
+            Refusal: BUSY, somebody else holds the mirror; PREEMPTED, `holder` lost it and has not held it again.
         """
         with self._lock:
             if not take_over:
@@ -112,9 +112,9 @@ class MirrorHold:
             return other
 
     def evict(self, by: str, take_over: bool = False) -> None:
-        """A command of `by` ("" = nobody in particular) is carried out: whoever else has the mirror loses it.
+        """Note that a command of `by` ("" = nobody in particular) is carried out: any other holder loses the mirror.
 
-        So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must say so.
+        So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must report it.
         """
         with self._lock:
             if take_over:  # it has taken the mirror back
@@ -126,7 +126,7 @@ class MirrorHold:
             raise Refusal(ErrorCode.PREEMPTED, f"{by} has taken the mirror over")
 
     def _evict(self, holder: str, by: str) -> None:
-        """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
+        """Note for any other holder than `holder`, even with a lapsed hold, that `by` has taken the mirror over."""
         if self._holder not in ("", holder):
             self._evicted[self._holder], self._holder = by, ""
             if len(self._evicted) > EVICTED_KEPT:

@@ -18,7 +18,7 @@ from dm_driver.electronics.frame_format import FrameFormat
 
 #: `DriveElectronics.needs` of units at a serial port.
 SERIAL_PORT: Final = ("serial_port", "a device file such as /dev/ttyUSB0")
-#: What pySerial raises beside OSError of a port that has not the speed or parity asked for.
+#: What pySerial raises beside OSError if a port does not support the speed or parity asked for.
 _UNOPENED: Final = (ValueError, termios.error)
 
 
@@ -40,13 +40,13 @@ class CodeError(ElectronicsError, ValueError):
 
 @dataclass(frozen=True)
 class ElectronicsSettings:
-    """Where a unit is. Each back end takes what it needs.
+    """How a unit is reached. Each back end uses the settings that it needs.
 
     Attributes:
         timeout_s: longest wait for the unit to take a frame or to answer.
         frame: of a framed serial unit.
-        doubt: codes by which frames on their way may differ from what has surely arrived, where a back end can tell;
-            0 = any.
+        doubt: codes by which frames under way may differ from what has surely arrived, if a back end knows that; 0 =
+            any.
         channels: output channels of a unit that has as many as it has actuators.
     """
 
@@ -75,8 +75,8 @@ class DriveElectronics(ABC):
     Outputs hold their last values when the link closes, and no supported unit can be read back: what was written is
     all that is known. One thread uses an object at a time.
 
-    Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link; `_do_open` also what `_UNOPENED`
-    names.
+    Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link; `_do_open` also those in
+    `_UNOPENED`.
 
     Args:
         settings: where it is.
@@ -89,12 +89,12 @@ class DriveElectronics(ABC):
     channels: int
     #: Code of full scale.
     max_code: int
-    #: The field of the settings without which it cannot be reached, and what that must be.
+    #: The field of the settings without which the unit cannot be reached, and what it must be.
     needs: tuple[str, str]
-    #: Frames per `limits.step` of a ramp: more than one where a frame may be lost without a trace, so that the next one
-    #: is no larger step.
+    #: Frames per `limits.step` of a ramp: more than one if a frame may be lost unnoticed, so that the next frame is
+    #: then no larger step.
     frames_per_step: int = 1
-    #: Most frames that the link carries, Hz: predicted times go by it. Infinite = none is known.
+    #: Highest frame rate of the link, Hz, from which times are predicted. Infinite = not known.
     frames_per_second: float = math.inf
     #: Whether `volts.*` are volts at the actuators; False where the unit takes other numbers.
     knows_volts: bool = True
@@ -111,7 +111,7 @@ class DriveElectronics(ABC):
     @property
     @abstractmethod
     def where(self) -> str:
-        """The unit and its place, for messages."""
+        """Name and address of the unit, for messages."""
 
     @property
     def is_open(self) -> bool:
@@ -119,7 +119,7 @@ class DriveElectronics(ABC):
 
     @property
     def sent_at(self) -> float:
-        """Steady time from which the pause until the next frame counts, s; asked for when `write` has returned."""
+        """Steady time, s, from which the pause until the next frame counts; read after `write` has returned."""
         return time.monotonic()
 
     def open(self) -> None:
@@ -134,7 +134,7 @@ class DriveElectronics(ABC):
             self._do_open()
         except (OSError, LinkError, *_UNOPENED) as error:
             self._abandon()
-            reason = re.sub(r".*\[Errno \d+\] ", "", str(error))  # pyserial says it twice, with the place
+            reason = re.sub(r".*\[Errno \d+\] ", "", str(error))  # pySerial repeats it, with the port
             raise LinkError(f"cannot open {self.where}: {reason}") from error
         self._open = True
 
@@ -143,8 +143,8 @@ class DriveElectronics(ABC):
 
         Args:
             codes: (channels,) unsigned integers 0..max_code, by connector channel.
-            wired: (channels,) True where an actuator is connected. Units that can, leave the other outputs alone;
-                the others set them to their `codes` too.
+            wired: (channels,) True where an actuator is connected. A unit leaves the other outputs alone if it can;
+                otherwise it sets them to their `codes` too.
 
         Raises:
             CodeError: wrong shape, type or range; nothing was sent.
@@ -156,7 +156,7 @@ class DriveElectronics(ABC):
         self._guard(lambda: self._do_write(codes, wired), "writing to")
 
     def check(self) -> None:
-        """Find out cheaply (microseconds, without waiting for an answer) whether the link still stands.
+        """Find out cheaply (microseconds, without waiting for an answer) whether the link is still up.
 
         Raises:
             NotOpenError: the link is closed.
@@ -198,7 +198,7 @@ class DriveElectronics(ABC):
             raise NotOpenError(f"{self.where} is not open")
 
     def _guard(self, action: Callable[[], None], what: str) -> None:
-        """Run `action`; a broken link is closed, because a stream cut inside a frame has lost its framing."""
+        """Run `action`; close a link that breaks, because a stream cut inside a frame has lost its framing."""
         try:
             action()
         except (OSError, LinkError) as error:
@@ -214,7 +214,7 @@ class DriveElectronics(ABC):
 
     @abstractmethod
     def _do_open(self) -> None:
-        """Open the link as `_link`, which has a method `close`."""
+        """Open the link and keep it as `_link`, an object with a method `close`."""
 
     @abstractmethod
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:

@@ -26,11 +26,11 @@ class CheckSum:
 
 
 def reflected_crc16(polynomial: int, start: int) -> CheckSum:
-    """A CRC of 16 bits that bytes enter with their least significant bit first; the value is not inverted.
+    """A 16-bit CRC that takes the least significant bit of each byte first; the value is not inverted.
 
     Args:
-        polynomial: without its highest term, mirrored: its least significant bit first.
-        start: of the register.
+        polynomial: without its highest term, bit-reversed: its least significant bit first.
+        start: initial value of the register.
     """
 
     def of_byte(register: int) -> int:

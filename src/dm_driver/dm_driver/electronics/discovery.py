@@ -39,12 +39,12 @@ def parse_reply(reply: bytes, sender: str) -> Unit | None:
 
 
 class Probe:
-    """A socket that asks and collects answers; the two are apart so that asking never waits."""
+    """A socket that asks and collects answers; the two are separate, so that asking never waits."""
 
     def __init__(self, address: str, port: int = PORT) -> None:
         try:
             self._destination = (socket.gethostbyname(address), port)
-        except UnicodeError as error:  # no name can be like that
+        except UnicodeError as error:  # not a possible name
             raise OSError(f"{address}: {error}") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

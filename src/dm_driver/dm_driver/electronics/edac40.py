@@ -24,9 +24,9 @@ CHANNELS: Final = 40
 MAX_CODE: Final = 0xFFFF
 COMMAND_VALUE: Final = 0
 
-#: Between two checks for an acknowledgement; a direct cable takes 0.1 to 0.3 ms [s].
+#: Pause between two checks for an acknowledgement; a direct cable takes 0.1 to 0.3 ms [s].
 _ACKNOWLEDGEMENT_PERIOD_S: Final = 1e-4
-#: A frame over UDP is sent again at so many checks of the link after it, if it is still the last one.
+#: Number of times that a frame over UDP is repeated, once at each check of the link, while it is the last one.
 _REPEATS: Final = 2
 
 #: Connector channel -> physical channel, both 0-based. The permutation is its own inverse.
@@ -54,7 +54,7 @@ def encode_frame(codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> bytes:
     return np.packbits(mask, bitorder="little").tobytes() + bytes([COMMAND_VALUE]) + values.tobytes()
 
 
-#: What pySerial would take for a part of its URL, and what no host name or IPv4 address holds.
+#: Characters that pySerial would take for part of its URL, and that no host name or IPv4 address holds.
 _NO_ADDRESS: Final = re.compile(r"[^\w.-]", re.ASCII)
 
 
@@ -79,10 +79,10 @@ class _Edac40(DriveElectronics):
 class Edac40Tcp(_Edac40):
     """EDAC40 over TCP. The unit takes one client at a time.
 
-    A unit that vanishes leaves nobody knowing which of the frames on their way it took. The shape that is sent when it
-    is back must be no step for it, so frames wait for the acknowledgement by the unit's TCP as soon as those on their
-    way differ from what has surely arrived by more than half of `doubt`: whichever of them stands at the outputs, the
-    last one is then at most `doubt` away. Small changes never wait.
+    When a unit vanishes, it is not known which of the frames under way it took. The shape that is sent when it is back
+    must be no step for it. So a frame that differs from what has surely arrived by more than half of `doubt` waits for
+    the acknowledgement by the unit's TCP: whichever frame is at the outputs, the last one is then at most `doubt`
+    away. Small changes never wait.
     """
 
     _protocol = "TCP"
@@ -116,7 +116,7 @@ class Edac40Tcp(_Edac40):
         self._last = codes.copy()
 
     def _await_arrival(self, codes: NDArray[np.uint16]) -> None:
-        """Wait until `codes` may be sent: see the head of the class.
+        """Wait until `codes` may be sent: see the docstring of the class.
 
         Raises:
             LinkError: no acknowledgement within the timeout.
@@ -141,7 +141,7 @@ class Edac40Tcp(_Edac40):
         return int(struct.unpack("i", answer)[0])
 
     def _do_check(self) -> None:
-        # The unit never sends: a readable link is one that has ended (read raises), or a stray byte (dropped).
+        # The unit never sends: a readable link has ended (read raises), or holds a stray byte (dropped).
         while self._link.in_waiting:
             self._link.read(1)
 
@@ -151,11 +151,11 @@ class Edac40Udp(_Edac40):
 
     A datagram to a unit that is off is lost without an error. A connected socket at least notices a host that is up
     but has no such port; with `discovery_port` the unit must answer discovery when the link is opened and, while it
-    stands, within `timeout_s`.
+    is up, within `timeout_s`.
 
-    Datagrams are lost, doubled and overtaken without a trace. So ramps are cut finer: with one lost or out of its turn
-    the outputs still change by less than `limits.step`. And the last frame is sent again, so that a shape that stands
-    is the whole shape.
+    Datagrams may be lost, doubled or reordered unnoticed. So ramps are cut finer: with one lost or out of order the
+    outputs still change by less than `limits.step`. And the last frame is sent again, so that the shape that stays at
+    the outputs is complete.
     """
 
     _protocol = "UDP"
@@ -196,9 +196,9 @@ class Edac40Udp(_Edac40):
             self._link.send(self._frame)
         if self._probe is None:
             return
-        # The answer to one question is looked for at the next check, so that a frame never waits for the network.
+        # The answer to a question is read at the next check, so that a frame never waits for the network.
         now = time.monotonic()
-        if list(self._probe.answers(0.0)):  # all: one that came twice would pass for life when the unit has gone
+        if list(self._probe.answers(0.0)):  # all: a duplicate would look like life after the unit has gone
             self._unanswered_since = None
         if self._unanswered_since is None:
             self._unanswered_since = now

@@ -26,10 +26,10 @@ MOST_WORD_BITS: Final = 32
 
 @dataclass(frozen=True)
 class FrameFormat:
-    """One unit's frames and line.
+    """Frames and line of one unit.
 
     Raises:
-        ValueError: values that are each allowed and do not fit each other, naming the parameters.
+        ValueError: values that are each allowed but contradict each other, naming the parameters.
     """
 
     channels: int = parameter(whole(40, 1, 4096), "Output channels of the unit.")

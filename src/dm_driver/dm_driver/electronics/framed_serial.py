@@ -37,7 +37,7 @@ class FramedSerial(DriveElectronics):
 
     @property
     def sent_at(self) -> float:
-        """Before the answer came: the frame and its answer share the time that the line needs for one."""
+        """When the frame was written, before its answer: the period of the line covers a frame and its answer."""
         return self._sent_at
 
     def _do_open(self) -> None:

@@ -1,6 +1,6 @@
 """Deformable mirrors that python-microscope drives, over its device server: ALPAO, Boston Micromachines, Mirao 52e, ...
 
-That program takes a pattern of numbers from 0 to 1, one for each actuator, and no other unit: `volts.*` of the driver
+That program takes a pattern of numbers from 0 to 1, one for each actuator, in no unit: `volts.*` of the driver
 are these numbers (0 and 1 at the ends, `amplifier_gain` 1), since the volts behind them cannot be known here.
 """
 
@@ -50,7 +50,7 @@ class MicroscopeMirror(DriveElectronics):
         self._asked(lambda: self._link.apply_pattern(codes / self.max_code))
 
     def _do_check(self) -> None:
-        # The server sends nothing unasked: a readable link is one that has ended.
+        # The server sends nothing unasked: a readable link has ended.
         if select.select([self._link._pyroConnection.sock], [], [], 0.0)[0]:
             raise LinkError("the device server closed the link")
 
@@ -60,8 +60,8 @@ class MicroscopeMirror(DriveElectronics):
             link._pyroRelease()
 
     def _asked(self, call: Callable[[], Any]) -> Any:
-        """The answer of `call`; what fails there, the maker's library included, breaks the link: the outputs are not
-        known then.
+        """The result of `call`; any failure there, also in the manufacturer's library, breaks the link, since the
+        outputs are then unknown.
         """
         try:
             return call()

@@ -1,1 +1,1 @@
-"""From shapes to the codes of a drive unit, and back to what stands at the actuators."""
+"""From shapes to the codes of a drive unit, and back to the signals at the actuators."""

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Fewer codes than this between signal -1 and +1 is a mistake in the configuration, not a mirror.
+#: Fewer codes than this between signal -1 and +1 are taken for a mistake in the configuration.
 MIN_CODES = 100
 _CODE_SLACK = 1e-6
 
@@ -100,7 +100,7 @@ class VoltScale:
         return np.asarray((dac_volts - self.dac_volts_at_zero) * (self.max_code / self._dac_span), dtype=np.float64)
 
     def signals_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
-        """Normalised signals that stand at the actuators for these codes."""
+        """Normalised signals at the actuators for these codes."""
         low, span = self._powers
         return np.asarray((self.volts_of_codes(codes) ** LAWS[self.law] - low) * (2.0 / span) - 1.0, dtype=np.float64)
 
@@ -111,7 +111,7 @@ class VoltScale:
 
     @property
     def resolution(self) -> float:
-        """Normalised signal of the code that counts most, the last one; quantisation moves no signal inside the range
+        """Normalised signal step of the last code, which is the largest; quantisation moves no signal inside the range
         by more than half of it.
         """
         volts_per_code = abs(self._dac_span * self.amplifier_gain) / self.max_code
@@ -120,7 +120,7 @@ class VoltScale:
 
     @property
     def _powers(self) -> tuple[float, float]:
-        """What is linear in the signal: its value at signal -1, and at +1 less that."""
+        """The quantity that is linear in the signal: its value at signal -1, and its change from -1 to +1."""
         low = self.volts_min ** LAWS[self.law]
         return low, self.volts_max ** LAWS[self.law] - low
 

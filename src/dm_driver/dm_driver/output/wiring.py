@@ -1,4 +1,4 @@
-"""Which connector channel drives which actuator (docs/protocols.md, wiring), and so the codes of a shape and back."""
+"""Which connector channel drives which actuator (docs/protocols.md, wiring): shapes to codes and back."""
 
 from collections import Counter
 from collections.abc import Sequence
