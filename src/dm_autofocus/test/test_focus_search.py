@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -200,6 +202,12 @@ def test_tracking_stays_inside_the_range() -> None:
         steps.append(tracker.step.curvature)
         tracker.feed(hill(tracker.step.curvature, HIGH + 0.002, 0.01))
     assert max(steps) <= HIGH
+
+
+def test_where_no_range_is_known_the_end_that_was_refused_gives_way() -> None:
+    tracker = tracker_at(LOW)
+    tracker.refuse(math.nan, math.nan)
+    assert LOW < tracker.step.curvature < (LOW + HIGH) / 2
 
 
 class TestSettledGate:

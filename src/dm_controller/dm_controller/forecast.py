@@ -121,7 +121,7 @@ class ForecastClient:
             if answer.message != self._told:
                 self._told = answer.message
                 self._node.get_logger().info(f"no prediction of the surface error: {answer.message}")
-            self._refused = answer.error_code in FINAL
+            self._refused = self._refused or answer.error_code in FINAL
             return
         answers[row] = answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():

@@ -114,7 +114,8 @@ class Tracker:
             ValueError: hardly anything of the range is left.
         """
         search, here = self._search, self.step.curvature
-        if here < (low + high) / 2:
+        middle = (low + high) / 2
+        if here < (middle if math.isfinite(middle) else (search.low + search.high) / 2):
             self._search = replace(search, low=max(here + STEP_BACK * search.tolerance, low))
         else:
             self._search = replace(search, high=min(here - STEP_BACK * search.tolerance, high))

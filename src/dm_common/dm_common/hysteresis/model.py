@@ -122,7 +122,8 @@ class HysteresisModel:
         if self.creep_covariance.size and self.creep_covariance.shape != expected:
             raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")
         if len({shape for shape in self._own if shape}) > 1:
-            raise ValueError(f"play_weight, duhem_slope, duhem_weight, creep_spectrum: of {self._own} actuators")
+            names = "play_weight, duhem_slope, duhem_weight, fading_weight, creep_spectrum, lag_spectrum"
+            raise ValueError(f"{names}: of {self._own} actuators")
         for name in (item.name for item in fields(self)):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} holds values that are not finite")

@@ -7,13 +7,14 @@ import numpy as np
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import SLOW_S
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_controller.planning.mirror_model import SIGMAS_95
 
 #: Ages of a shape, s, for which a bound holds, besides the moment when it is to be right.
 AGES = (1.0, 10.0, 100.0)
 #: Time after `crept_at` to which the figure refers, including creep left then, s: half of a typical run.
 IN_FIGURE_S = 200.0
 #: 95 % quantile, in standard deviations, of one error, and of the largest of as many as a mirror has coefficients.
-ONE, LARGEST = 1.96, 2.5
+ONE, LARGEST = SIGMAS_95, 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
 #: Relative error of creep that is not known better: of elements with time constants (s) below and above these two, if

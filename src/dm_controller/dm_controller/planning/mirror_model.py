@@ -31,6 +31,8 @@ RIDGE_SHARE_STUCK = 0.1
 TILT_WEIGHT = 10.0
 #: Tilt at the edge, as a share of the largest response, below which maps do not show it; an actuator makes 1.5.
 LEAST_TILT = 0.05
+#: Half-width of a 95 % interval in standard deviations.
+SIGMAS_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class Plan:
 
 def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
     """95 % interval of an rms, m, when an independent error with the rms `spread` (m) is added in squares."""
-    reach = (1.96 * spread) ** 2
+    reach = (SIGMAS_95 * spread) ** 2
     return math.sqrt(max(rms**2 - reach, 0.0)), math.sqrt(rms**2 + reach)
 
 

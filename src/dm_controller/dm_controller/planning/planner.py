@@ -22,7 +22,7 @@ from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import IN_USE, HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
-from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
+from dm_controller.planning.mirror_model import SIGMAS_95, CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
@@ -261,7 +261,7 @@ class Planner:
     def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:
         crept, crept_rms = (creep.max_zernike, creep.rms) if creep is not None else (0.0, 0.0)
         rms_spread = math.hypot(
-            self.mirror.model.held_out_rms, 0.0 if known else self._unknown_history[1], crept_rms / 1.96
+            self.mirror.model.held_out_rms, 0.0 if known else self._unknown_history[1], crept_rms / SIGMAS_95
         )
         largest_spread = self.error_bound(known, None if error is None else error - plan.max_zernike)
         most = ""
@@ -291,6 +291,7 @@ class Planner:
         miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
         largest = np.abs(miss @ model.influence_zernike[PISTON_TILT:].T).max(axis=1)
         area = model.sample_weight[:, None] * np.square(model.influence_sag)
-        together = 1.96 * sigma * self._largest(self._whole), sigma * np.linalg.norm(self.mirror.sag_root @ self._whole)
+        rms = sigma * np.linalg.norm(self.mirror.sag_root @ self._whole)
+        together = SIGMAS_95 * sigma * self._largest(self._whole), rms
         apart = np.quantile(largest, 0.95), sigma * np.sqrt(area.sum())
         return float(max(apart[0], together[0])), float(max(apart[1], together[1]))
