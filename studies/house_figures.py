@@ -1,7 +1,7 @@
-"""How large the house is and how far one walks in it: `python -m studies.house_figures [ROOT]`, `--json` for programs.
+"""Size of the code and length of its paths: `python -m studies.house_figures [ROOT]`, `--json` for programs.
 
-Standard library only, and nothing of this checkout but what is measured, so it also measures another checkout: run the
-file with that checkout's `./dm exec python`, from its root.
+Uses the standard library only, and of this checkout nothing but what it measures, so it can measure another checkout:
+run the file with that checkout's `./dm exec python`, from its root.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ REPRESENTATIONS = (
     "InfluenceModel",
     "CalibratedMirror",
 )
-#: Prints our modules that the node loads, packages included.
+#: Script that prints the project's modules that the node loads, packages included.
 LOADED = """
 import json, sys
 import dm_controller.focus_controller_node
 print(json.dumps([name for name in sys.modules if name.split(".")[0] in sys.argv[1:]]))
 """
-#: Hands a request to the node's own subscription and prints our files that are entered until the command is published.
+#: Script that passes a request to the node's subscription and prints our files entered until the command is published.
 WALKED = """
 import glob, json, os, sys, tempfile
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp()
@@ -88,7 +88,7 @@ def lines_of(paths: list[Path]) -> int:
 
 
 def reach_of(root: Path) -> dict[str, set[str]]:
-    """Packages of the workspace that each may use by its package.xml, with what those use in turn."""
+    """Packages of the workspace that each may use by its package.xml, directly or through others."""
     files = {path.parent.name: path for path in root.glob("src/*/package.xml")}
     direct = {
         name: {item.text for item in ElementTree.parse(path).getroot() if item.tag in ("depend", "exec_depend")}
@@ -105,9 +105,9 @@ def reach_of(root: Path) -> dict[str, set[str]]:
 
 
 def tests_out_of_reach(root: Path) -> tuple[list[str], int]:
-    """Test files of packages that import another package than theirs may, or helpers of tests/; and how many there are.
+    """Test files of packages that import a package beyond their own's reach, or helpers of tests/; number of all files.
 
-    What a package's own test folder holds is within its reach.
+    Modules in a package's own test folder are within its reach.
     """
     packages, outside, count = reach_of(root), [], 0
     shared = {path.stem for path in (root / "tests").glob("*.py")} | {"fault_injection", "studies"}
@@ -128,7 +128,7 @@ def tests_out_of_reach(root: Path) -> tuple[list[str], int]:
 
 
 def printed_by(script: str, *arguments: str) -> Any:
-    """What a script prints last, as JSON, in a process of its own; None = it failed, and its last line is shown."""
+    """The last line that a script prints, as JSON, in a process of its own; None = it failed, which is shown."""
     done = subprocess.run([sys.executable, "-c", script, *arguments], check=False, capture_output=True, text=True)
     if done.returncode != 0:
         print("not measured:", (done.stderr.strip().splitlines() or ["no message"])[-1], file=sys.stderr)
@@ -171,7 +171,7 @@ def figures_of(root: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the figures, one a line."""
+    """Print the figures, one per line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).resolve().parents[1])
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -1,7 +1,7 @@
 """Hosts on this machine: network namespaces, each with its own interfaces, and a cable between two of them.
 
-DDS finds the other host by multicast and talks to it over UDP, as between two machines. Making them takes root on
-Linux; elsewhere NotPermittedError says why.
+DDS finds the other host by multicast and talks to it over UDP, as between two machines. Creating them requires root on
+Linux; otherwise NotPermittedError gives the reason.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NAMES = Path("/run/netns")
 
 
 class NotPermittedError(Exception):
-    """This machine does not let us make network namespaces; the message says why."""
+    """This machine does not allow network namespaces to be made; the message gives the reason."""
 
 
 def ip(*arguments: str) -> str:
@@ -41,13 +41,13 @@ def ip(*arguments: str) -> str:
 
 
 def command_on(host: str) -> list[str]:
-    """What to put in front of a command, so that it runs on a host."""
+    """The words in front of a command that make it run on a host."""
     return ["ip", "netns", "exec", host]
 
 
 @contextlib.contextmanager
 def one_host() -> Iterator[str]:
-    """Name of a host that reaches nobody but itself."""
+    """Name of a host that reaches only itself."""
     name = f"dm-{os.getpid()}-0"
     ip("netns", "add", name)
     try:
@@ -60,7 +60,7 @@ def one_host() -> Iterator[str]:
 
 @contextlib.contextmanager
 def unconnected_hosts() -> Iterator[tuple[str, str]]:
-    """Names of two hosts that want a cable; give both an interface INTERFACE and call `bring_up`."""
+    """Names of two hosts without a cable; give both an interface INTERFACE and call `bring_up`."""
     names = [f"dm-{os.getpid()}-{side}" for side in (1, 2)]
     made: list[str] = []
     try:
@@ -74,7 +74,7 @@ def unconnected_hosts() -> Iterator[tuple[str, str]]:
 
 
 def bring_up(*hosts: str) -> None:
-    """Give each host's interfaces their addresses, and multicast its way."""
+    """Give each host's interfaces their addresses, and a route for multicast."""
     for number, name in enumerate(hosts, 1):
         ip("-n", name, "address", "add", f"10.77.0.{number}/24", "dev", INTERFACE)
         ip("-n", name, "link", "set", "lo", "up")
@@ -92,17 +92,17 @@ def two_hosts() -> Iterator[tuple[str, str]]:
 
 
 def received_bytes(host: str) -> int:
-    """What came over the cable so far."""
+    """Number of bytes received over the cable so far."""
     links = json.loads(ip("-n", host, "-s", "-json", "link", "show", INTERFACE))
     return int(links[0]["stats64"]["rx"]["bytes"])
 
 
 @contextlib.contextmanager
 def inside(host: str) -> Iterator[None]:
-    """This thread, and threads and sockets that it makes meanwhile, belong to a host.
+    """Move this thread, and the threads and sockets that it makes meanwhile, to a host.
 
     Raises:
-        NotPermittedError: not as this user.
+        NotPermittedError: this user may not do so.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     with Path("/proc/thread-self/ns/net").open("rb") as before, (_NAMES / host).open("rb") as namespace:

@@ -30,7 +30,7 @@ PIXELS = 400
 
 
 class View:
-    """The mirror as a noise-free camera over the working aperture sees it."""
+    """The mirror as seen by a noise-free camera over the working aperture."""
 
     def __init__(self, plate: Plate, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -42,7 +42,7 @@ class View:
         self.y = self.x[::-1]
 
     def show(self, figure: Figure, axes: Axes, sag_nm: Array, title: str, label: str) -> None:
-        """Draw a map in nm with the actuators that lie in it."""
+        """Draw a map in nm with the actuators inside it."""
         half = self.radius * 1e3
         image = axes.imshow(sag_nm, cmap=COLOURS, extent=(-half, half, -half, half), origin="upper")
         inside = np.hypot(self.plate.x, self.plate.y) < self.radius
@@ -57,10 +57,10 @@ class View:
 
 
 def sphere_command(view: View, curvature: float, stroke: float) -> tuple[Array, Array, Array]:
-    """Best signals inside -1..+1 for a sphere, piston and tilt free; the surface they give and what is left of it.
+    """Best signals inside -1..+1 for a sphere, piston and tilt free; the resulting surface and the residual.
 
     Returns:
-        signals (37,); sag, its tilt taken off, and residual (pixels, pixels) in m.
+        signals (37,); sag, its tilt removed, and residual (pixels, pixels) in m.
     """
     x, y = np.meshgrid(view.x, view.y)
     inside = view.camera.aperture

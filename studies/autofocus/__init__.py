@@ -1,1 +1,1 @@
-"""How many images a search of the sharpest focus takes: ours beside others, on scenes drawn at random."""
+"""Number of images that a search for the sharpest focus takes: ours beside others, on scenes drawn at random."""

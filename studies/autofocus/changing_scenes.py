@@ -1,7 +1,7 @@
 """Time out of focus while a scene changes (`python -m studies.autofocus.changing_scenes`): a table of docs/camera.md.
 
-Each way to stay on the focus begins on it and then meets the same four seconds of a drawn scene: an object that comes
-nearer, half the light from one image to the next, lamps that flicker, somebody who walks through the region.
+Each method of staying in focus begins in focus and then meets the same four seconds of a drawn scene: an object that
+comes nearer, half the light from one image to the next, lamps that flicker, somebody who walks through the region.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from studies.autofocus.scenes import RANGE, SIZE, Scene, SceneCamera, draw_scene
 from studies.autofocus.trials import COARSE_STEP, RATE, READ_OUT, SETTLE, SLEW, model_of, search_of
 
 SECONDS = 4.0
-#: Infinity is in focus at -RANGE; the object comes nearer from START at SPEED until NEAREST [m, m/s].
+#: Infinity is in focus at -RANGE; the object comes nearer from START [m] at SPEED [m/s] until NEAREST [m].
 START, SPEED, NEAREST = 9.0, 1.0, 5.2
-#: When the light falls and somebody comes [s], how fast they walk [px/s], how broad they are [px], and where they are.
+#: When the light falls and the walker comes [s]; the walker's speed [px/s], breadth [px], and curvature in focus [1/m].
 CHANGE, WALK, BROAD, WALKER = 1.0, 320.0, 120, 0.04
-#: Of the lamps [Hz].
+#: Frequency of the lamps [Hz].
 FLICKER = 100.0
-#: As the node does by default.
+#: Tracking parameters, as the node has them by default.
 TRACKED = TrackConfig()
 KINDS = ("approach", "light", "flicker", "walker")
 
@@ -55,7 +55,7 @@ class Stage:
         return self.seconds < SECONDS
 
     def focus(self, seconds: float) -> float:
-        """Curvature that the object is in focus at [1/m]."""
+        """Curvature at which the object is in focus [1/m]."""
         return _focus_on(max(START - SPEED * seconds, NEAREST)) if self.kind == "approach" else self.scene.start
 
     def go(self, place: float) -> None:
@@ -65,7 +65,7 @@ class Stage:
             self.place = place
 
     def expose(self) -> tuple[float, NDArray[np.float64]]:
-        """When the next image begins, and its region of interest."""
+        """Start of the next exposure [s], and the region of interest of its image."""
         begin = (math.floor(self.seconds * RATE) + 1) / RATE
         image = self._camera.expose(self.place - self.focus(begin) + self.scene.start).astype(float)
         if self.kind == "walker":
@@ -82,7 +82,7 @@ class Stage:
         return begin, cut(image, self._camera.region())
 
     def off(self) -> NDArray[np.float64]:
-        """By how much the focus was off over time, in depths of focus."""
+        """Focus error over time, in depths of focus."""
         times, places = np.array(self._taken).T
         grid = np.arange(0, SECONDS, 0.005)
         stood = places[np.minimum(np.searchsorted(times, grid), len(places) - 1)]
@@ -90,7 +90,7 @@ class Stage:
 
 
 def track(stage: Stage, by_optics: bool = True) -> None:
-    """As the node does, by the optics or by sharpness alone."""
+    """Track as the node does, by the optics or by sharpness alone."""
     config, model = search_of(stage.scene), model_of(stage.scene)
 
     def tracker_of(peak: Peak) -> Tracker:
@@ -113,7 +113,7 @@ def track(stage: Stage, by_optics: bool = True) -> None:
 
 
 def search_anew(stage: Stage) -> None:
-    """Stand still, and begin the contrast search anew when the sharpness has changed."""
+    """Keep the focus, and begin the contrast search anew when the sharpness has changed."""
     depth = stage.scene.depth_of_focus
     normal, other = tenengrad(stage.expose()[1]), 0
     while stage.running:
@@ -141,7 +141,7 @@ WAYS: dict[str, Callable[[Stage], None]] = {
 
 
 def out_of_focus(kind: str, way: str, seed: int) -> tuple[float, float]:
-    """Share of the time that the focus is off by more than one and by more than two depths of focus."""
+    """Shares of the time in which the focus is off by more than one, and by more than two depths of focus."""
     stage = Stage(seed, kind)
     WAYS[way](stage)
     off = stage.off()
@@ -153,7 +153,7 @@ def _focus_on(distance: float) -> float:
 
 
 def main() -> None:
-    """Print the table for as many scenes as the first argument says, and the changes that follow it; none = all."""
+    """Print the table. Arguments: number of scenes, then the changes to include; none = all."""
     seeds = range(4300, 4300 + int(sys.argv[1] if len(sys.argv) > 1 else 12))
     for kind in sys.argv[2:] or KINDS:
         for way in WAYS:

@@ -1,9 +1,9 @@
 """Parts of a real photograph through the true surface of mirrors (`python -m studies.autofocus.photographs`).
 
-Each simulated plate is calibrated by its interferometer, hysteresis and noise included. Then, without hysteresis, it
-goes where the calibrated model sends it, with its own figure, print-through and the errors of the model. The camera of
-the virtual bench sees part of a photograph; distance, exposure and start are drawn. Errors are those of the true
-surface's defocus.
+Each simulated plate is calibrated by its interferometer, hysteresis and noise included. Then it moves, without
+hysteresis, as the calibrated model commands; figure, print-through and errors of the model remain. The camera of the
+virtual bench sees part of a photograph; distance, exposure and start are drawn at random. Errors are those of the
+defocus of the true surface.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from studies.autofocus.scenes import RANGE, part_of_photograph
 from studies.autofocus.trials import COARSE_STEP
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
-#: Of the maps, and of the camera [px along a side].
+#: Pixels along a side of the maps, and of the camera.
 PIXELS, SIDE = 118, 192
 SCENES = 15
 
@@ -57,7 +57,7 @@ class Plate:
         return self._bench.true_stroke * self._mirror.command(FocusTarget(curvature))[0]
 
     def search(self, number: int) -> tuple[int, float]:
-        """Images of one search, and by how many depths of focus it is off; inf = it found nothing."""
+        """Number of images of one search, and its error in depths of focus; inf = it found nothing."""
         rng = np.random.default_rng((20, self._seed, number))
         dioptre, photons = rng.uniform(0.005, 0.195), float(np.exp(rng.uniform(np.log(300), np.log(30000))))
         camera = CameraConfig(width=SIDE, height=SIDE, distances=(1 / dioptre,), photons=photons)

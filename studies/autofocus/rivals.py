@@ -1,7 +1,7 @@
-"""Searches of the sharpest focus that know only the sharpness of images, written for the comparison.
+"""Searches for the sharpest focus that use only the sharpness of images, written for the comparison.
 
-Each is a generator: it yields where to take an image [1/m], is sent the sharpness there, and returns where to stand, or
-None where it finds no focus. `step` is the coarse step and `fine` the finest [1/m].
+Each is a generator: it yields the curvature of the next image [1/m], is sent the sharpness there, and returns the best
+curvature, or None if it finds no focus. `step` is the coarse step and `fine` the finest [1/m].
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def full_sweep(task: Task) -> Search:
 
 
 def hill_climb(task: Task) -> Search:
-    """Step towards where it is sharper; turn with a smaller step where it is not [25]."""
+    """Step towards greater sharpness; reverse with a smaller step where it falls [25]."""
     place, step = task.start, task.step
     here = yield place
     turned = 0
@@ -89,10 +89,10 @@ def fibonacci_search(task: Task) -> Search:
 def contrast_rules(task: Task) -> Search:
     """Rules as in libcamera's contrast autofocus (rpi `af.cpp` [35]), without its phase detection.
 
-    Scan in coarse steps from where the lens stands until the contrast has fallen to three quarters of its largest; turn
-    round when the first image was not below that yet; then scan back over the peak in steps a quarter as large. The
-    range counts 12 coarse steps, as there. Focused = the contrast at the end is three quarters of the largest, and
-    something in the scan lay below that.
+    Scan in coarse steps from the present position until the contrast has fallen to three quarters of its maximum; turn
+    round if the first image was not below that yet; then scan back over the peak in steps a quarter as large. The
+    range is 12 coarse steps, as in libcamera. In focus = the contrast at the end is at least three quarters of the
+    maximum, and the lowest contrast of the scan is at most that.
     """
     ratio, coarse = 0.75, (task.high - task.low) / 12
     if task.start <= task.low + 2 * coarse:
@@ -131,7 +131,7 @@ def contrast_rules(task: Task) -> Search:
 
 
 def _vertex(places: np.ndarray, seen: np.ndarray, top: int) -> float:
-    """Top of the parabola through a value and its two neighbours; the value's own place where there is none."""
+    """Vertex of the parabola through a value and its two neighbours; the value's own place if there is no maximum."""
     if len(places) < 3:
         return float(places[top])
     middle = min(max(top, 1), len(places) - 2)

@@ -1,10 +1,10 @@
-"""Scenes drawn at random, seen through a mirror: what `dm compare --autofocus` judges searches on.
+"""Scenes drawn at random, seen through a mirror: `dm compare --autofocus` judges searches on them.
 
-Shares no code with the model of `dm_autofocus`: the image is the texture folded with the squared modulus of the
+Shares no code with the model of `dm_autofocus`: the image is the texture convolved with the squared modulus of the
 Fourier transform of the pupil (Goodman, Introduction to Fourier Optics, section 6.4), twice as fine as the camera's
 pixels, which then integrate. Drawn are the optics, the mirror's residual aberrations and the error of each of its
 moves, the spectrum of the light and of the texture, vignetting, flicker, noise and the bits of the camera, and in some
-scenes a background at another distance. What a search is told of the optics is off by some per cent.
+scenes a background at another distance. The optical parameters given to a search are wrong by some per cent.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scipy import fft, ndimage
 
 Floats = NDArray[np.float64]
 
-#: Image [px along a side], and how many times finer than its pixels it is rendered.
+#: Image [px along a side], and the factor by which it is rendered finer than its pixels.
 SIZE, FINER = 256, 2
 #: Range of the mirror's curvature [1/m].
 RANGE = 0.05
 TEXTURES = ("cloud", "leaves", "text", "points", "grating", "tiles", "soft")
-#: One more, which is not drawn: a part of the photograph that Matplotlib ships.
+#: A texture that is not drawn at random: a part of the photograph that Matplotlib ships.
 PHOTOGRAPH = "photograph"
 
 
@@ -34,8 +34,8 @@ class Scene:
         seed: everything is drawn from it.
         texture: one of TEXTURES, or PHOTOGRAPH; "" = none at all.
         object_curvature: of the mirror at which the object has no defocus [1/m].
-        background: the same for what stands around the object; None = nothing else is there.
-        start: where the mirror stands before the search [1/m].
+        background: the same for the surroundings of the object; None = there are none.
+        start: curvature of the mirror before the search [1/m].
         aperture_radius: of the beam on the mirror [m].
         wavelengths: of the light [m], equal shares.
         focal_length_px: of the lens, in pixels.
@@ -45,8 +45,8 @@ class Scene:
         bits: of the camera.
         region_px: side of the square region of interest, in the middle.
         move_error: standard deviation of the curvature that a move ends at [1/m].
-        aberration: rms surface of the residual aberrations [m].
-        misinformed: factors on focal length and aperture radius that the search is told.
+        aberration: rms of the residual aberrations, as surface [m].
+        misinformed: factors by which the focal length and aperture radius given to the search are wrong.
     """
 
     seed: int
@@ -73,12 +73,12 @@ class Scene:
 
     @property
     def depth_of_focus(self) -> float:
-        """Curvature off the focus at which the wavefront is a quarter wave off at the edge [1/m]."""
+        """Curvature error at which the wavefront error at the edge is a quarter wave [1/m]."""
         return self.wavelength / 4 / self.aperture_radius**2
 
 
 def draw_scene(seed: int, textured: bool = True) -> Scene:
-    """The scene of a seed, with or without anything to focus on."""
+    """Draw the scene of a seed, with or without a texture to focus on."""
     rng = np.random.default_rng((17, seed))
     radius = rng.uniform(9e-3, 11.5e-3)
     wavelength = rng.uniform(450e-9, 650e-9)
@@ -112,7 +112,7 @@ class SceneCamera:
 
     Attributes:
         scene: what is seen.
-        images: so many were taken.
+        images: number of images taken.
     """
 
     scene: Scene
@@ -198,7 +198,7 @@ class SceneCamera:
         return vignetting, 1 + 0.005 * rng.standard_normal((SIZE, SIZE))
 
     def _draw_layers(self) -> list[tuple[NDArray[np.complex64], float]]:
-        """Fourier transform of what stands at each distance, and the curvature that focuses on it."""
+        """Fourier transform of the texture at each distance, and the curvature that focuses on it."""
         scene, rng = self.scene, self._rng
         here = _texture(scene.texture, scene.contrast, self._fine, rng)
         if scene.background is None:

@@ -1,7 +1,7 @@
 """Accuracy of the depth image over distance (`python -m studies.autofocus.stacks`): the table of docs/camera.md.
 
-The simulated camera of the virtual bench sees objects side by side through a mirror of the curvature asked for; its
-stacks go through the same code as those of the node.
+The simulated camera of the virtual bench sees objects side by side through a mirror with exactly the requested
+curvature; its stacks go through the same code as those of the node.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from dm_simulation.camera import CameraConfig, SceneCamera
 
 DISTANCES = (5.5, 7.0, 10.0, 15.0, 30.0, 60.0)
 REST_DISTANCE, RADIUS, RANGE = 10.0, 0.011, 0.05
-#: Side of an object [px], and how much of its edges is left out: blurred parts of its neighbours reach there.
+#: Side of an object [px], and the margin at its edges that is left out: blurred neighbours reach into it.
 SIDE, EDGE = 120, 24
 CELL, LEAST_CONTRAST = 4, 0.05
 
 
 @dataclass(frozen=True)
 class Depth:
-    """What a stack says of one object.
+    """Result of a stack for one object.
 
     Attributes:
         distance: true [m].
         share: of its cells that have a distance.
         found: their median [m].
-        errors: of the focus, in depths of focus; median and 90 % of their amounts.
-        relative: 90 % of the amounts of the relative errors of distance.
+        errors: median and 90th percentile of the absolute errors of the focus, in depths of focus.
+        relative: 90th percentile of the absolute relative errors of distance.
     """
 
     distance: float

@@ -18,12 +18,12 @@ from dm_autofocus.sharpness import cut, tenengrad
 from studies.autofocus.rivals import RIVALS, Task
 from studies.autofocus.scenes import RANGE, Scene, SceneCamera, draw_scene
 
-#: Name of our search, and of the one before it: the range swept, each sweep from its low end.
+#: Names of our search and of its predecessor, which sweeps the range, each sweep from its low end.
 OURS, BEFORE = "few images", "sweep from below"
 #: Coarse step in depths of focus, as the node has it.
 COARSE_STEP = 8.0
-#: Time of a search: camera [images per second], from the end of an exposure to the request that follows from it [s],
-#: slew of the mirror [1/m per s], and wait after it [s]. Exposures begin at a multiple of the period.
+#: Time of a search: camera [images per second], from the end of an exposure to the next request [s], slew of the
+#: mirror [1/m per s], and wait after it [s]. Exposures begin at a multiple of the period.
 RATE, READ_OUT, SLEW, SETTLE = 30.0, 0.012, 2.5, 0.012
 
 
@@ -32,12 +32,12 @@ class Trial:
     """One search on one scene.
 
     Attributes:
-        method: which.
-        scene: on what.
-        images: taken.
-        seconds: it would take at RATE images per second.
+        method: name of the search.
+        scene: the scene.
+        images: number of images taken.
+        seconds: that it would take at RATE images per second.
         error: of the place, in depths of focus; None = it found no focus.
-        swept: ours alone: the reason why it swept the range after all; "" = it did not.
+        swept: only of our search: why it swept the whole range after all; "" = it did not.
     """
 
     method: str
@@ -68,14 +68,14 @@ class _Stage:
 
 
 def search_of(scene: Scene) -> SearchConfig:
-    """The search of a scene, as the node has it where the hysteresis is known."""
+    """Configuration of the search of a scene, as the node has it when the hysteresis is known."""
     depth = scene.depth_of_focus
     points = max(NOISE_POINTS, 1 + math.ceil(2 * RANGE / (COARSE_STEP * depth)))
     return SearchConfig(-RANGE, RANGE, depth, points, approach=0.0)
 
 
 def model_of(scene: Scene) -> DefocusModel:
-    """The camera of a scene, as it is told."""
+    """Model of the camera of a scene, with the wrong parameters that the search is given."""
     told = FocusLens(
         scene.aperture_radius * scene.misinformed[1], scene.wavelength, scene.focal_length_px * scene.misinformed[0]
     )
@@ -147,14 +147,14 @@ def _blank(seed: int) -> list[Trial]:
 
 
 def run_scenes(seeds: Iterable[int], textured: bool, workers: int) -> Iterator[list[Trial]]:
-    """`run_scene` for each seed, in processes; scenes without texture only by ours."""
+    """`run_scene` for each seed, in processes; scenes without texture by our search only."""
     with ProcessPoolExecutor(workers) as pool:
         yield from pool.map(run_scene if textured else _blank, seeds, chunksize=1 if textured else 20)
 
 
 @dataclass(frozen=True)
 class Figures:
-    """A method over all scenes: images and seconds (median, 90 %), shares of errors, largest share of false finds."""
+    """A method over all scenes: images and seconds (median, 90 %), then shares; see `figures_of`."""
 
     images: tuple[float, float]
     seconds: tuple[float, float]
@@ -166,7 +166,7 @@ class Figures:
 
 
 def figures_of(trials: list[Trial]) -> Figures:
-    """Figures of one method's trials; an error counts in depths of focus, `gross` = found, but more than 3 off."""
+    """Figures of one method's trials; errors count in depths of focus, `gross` = found, but more than 3 off."""
     images = np.array([trial.images for trial in trials])
     seconds = np.array([trial.seconds for trial in trials])
     errors = np.array([np.inf if trial.error is None else abs(trial.error) for trial in trials])

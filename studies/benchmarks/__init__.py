@@ -1,1 +1,1 @@
-"""Measurements of speed and memory, each beside what a user would take instead, in one run on one machine."""
+"""Measurements of speed and memory, each beside the usual alternative, in one run on one machine."""

@@ -1,4 +1,4 @@
-"""The programs that the suite is measured against: taken from the environment, else installed apart from it."""
+"""The programs with which the suite is compared: from the environment, else installed in a folder apart from it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-#: Modules by the name of the package that brings them.
+#: Modules by the name of the package that provides them.
 MODULES = {"prysm": "prysm.polynomials", "hcipy": "hcipy", "zernike": "zernike"}
 
 
 def load(root: Path, install: bool, say: Callable[[str], None]) -> dict[str, ModuleType]:
-    """Import the rivals that can be had.
+    """Import the rivals that are available.
 
     Args:
-        root: of the repository; what is missing goes to its folder ``runs/bench-packages``, behind the environment's
+        root: of the repository; missing packages go to its folder ``runs/bench-packages``, behind the environment's
             own packages on the path, so that NumPy and SciPy stay the pinned ones.
         install: whether to install what is missing.
         say: gets one line for each thing a user should know.

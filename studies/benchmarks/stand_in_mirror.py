@@ -1,7 +1,7 @@
-"""A mirror to measure with: an analytic plate under a hexagon of actuators with hysteresis, and what is known of it.
+"""A mirror for benchmarks: an analytic plate under a hexagon of actuators with hysteresis, and its calibration.
 
-The hysteresis models are identified as in a calibration, but from the displacements of the simulation's actuators
-seen through a random matrix, so that no maps have to be made.
+The hysteresis models are identified as in a calibration, but from the displacements of the simulated actuators
+projected by a random matrix, so that no maps have to be made.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from studies.benchmarks.jobs.bounded_solve import PITCH, STROKE
 from studies.solvers.plate_model import PlateProperties, plate_influence
 
-#: By the class of the law that is fitted: what the simulation's actuators follow.
+#: Hysteresis law of the simulated actuators, by the class of the law that is fitted.
 SIMULATED_LAWS = {
     "Prandtl-Ishlinskii": "prandtl_ishlinskii",
     "Preisach": "preisach",
     "Preisach and Duhem": "bouc_wen",
 }
 MAPS = 120
-#: Actuators of the run, and numbers measured per map.
+#: Actuators of the run, and number of values measured per map.
 ACTUATORS, NUMBERS = 7, 12
 SIGMA = 3e-10  # m, of a coefficient
 WORKING_RADIUS = 11e-3  # m, of 37 actuators
@@ -49,7 +49,7 @@ SERIAL = "bench"
 
 @cache
 def identified_law(name: str) -> HysteresisModel:
-    """The law of class `name` (of SIMULATED_LAWS), fitted to actuators of the simulation that follow a like one."""
+    """The law of class `name` (of SIMULATED_LAWS), fitted to simulated actuators that follow a law of this kind."""
     x, y = hexagonal_positions(ACTUATORS, PITCH)
     mirror = Mirror("hexagon", "", x, y, WORKING_RADIUS, Limits(pairs=neighbour_pairs(x, y)))
     generator = np.random.default_rng(ACTUATORS)
@@ -70,7 +70,7 @@ def identified_law(name: str) -> HysteresisModel:
 
 
 def figures(law: HysteresisModel) -> HysteresisFigures:
-    """What a calibration would say of `law`."""
+    """The figures that a calibration would give for `law`."""
     return HysteresisFigures(law, 1e-9, 0.05)
 
 

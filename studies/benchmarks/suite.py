@@ -20,7 +20,7 @@ from studies.benchmarks.timing import Effort, machine
 
 Job = Callable[[Effort, dict[str, ModuleType]], dict[str, Any]]
 
-#: By the name that `--only` takes; from `focus` on with nodes in processes of their own, but for `calibration`.
+#: By the name that `--only` takes. Jobs from `focus` on start nodes in processes of their own, except `calibration`.
 JOBS: Mapping[str, Job] = {
     "fit": map_fitting.measure,
     "read": map_reading.measure,

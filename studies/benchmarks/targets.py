@@ -1,4 +1,4 @@
-"""What is to be reached, as sentences about the figures of a run."""
+"""The targets of the benchmarks: limits for the figures of a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Figures = dict[str, Any]
 
 
 def figure(figures: Figures, path: str) -> float:
-    """The figure at "part.of.it"; KeyError where the job was not run."""
+    """The figure at a path such as "part.of.it"; KeyError if the job was not run."""
     found: Any = figures
     for key in path.split("."):
         found = found[key]
@@ -18,7 +18,7 @@ def figure(figures: Figures, path: str) -> float:
 
 @dataclass(frozen=True)
 class Limit:
-    """A number, or so many times the figure at `of`."""
+    """A number, or a multiple of the figure at `of`."""
 
     factor: float
     of: str = ""
@@ -34,9 +34,9 @@ class Target:
     Attributes:
         job: what is done.
         unit: of all figures of the line.
-        value: where the figure is.
+        value: path of the figure.
         limit: what it must not exceed.
-        beside: what else was measured in the same run, by name: where the figures are.
+        beside: paths of other figures of the same run, by name.
     """
 
     job: str
@@ -46,7 +46,7 @@ class Target:
     beside: dict[str, str]
 
     def row(self, figures: Figures) -> dict[str, Any]:
-        """The line for figures that hold what it needs; KeyError otherwise."""
+        """The line of the table; KeyError if a figure that it needs is missing."""
         value, limit = figure(figures, self.value), self.limit.value(figures)
         return {
             "job": self.job,
@@ -179,7 +179,7 @@ TARGETS: tuple[Target, ...] = (
 
 
 def rows(figures: Figures) -> list[dict[str, Any]]:
-    """The lines of all targets whose figures are there."""
+    """The lines of all targets whose figures are available."""
     result = []
     for target in TARGETS:
         try:

@@ -1,4 +1,4 @@
-"""Timing that neighbours on the machine disturb little: everything that is compared takes turns."""
+"""Timing that is robust against other load on the machine: the jobs that are compared take turns."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def medians(
 ) -> dict[str, float]:
     """Median time of every job, s.
 
-    Every job runs once unmeasured. Then they take turns, so that a busy moment of the machine meets all of them and a
-    ratio of two medians is worth more than either.
+    Every job runs once unmeasured. Then they take turns, so that a busy moment of the machine affects all of them: a
+    ratio of two medians is more reliable than either.
 
     Args:
         rounds: number of turns.
@@ -72,7 +72,7 @@ def medians(
 
 
 def machine() -> dict[str, Any]:
-    """What a figure of time depends on, without names of the machine."""
+    """Facts on which timings depend, without the names of the machine."""
     model = "unknown"
     information = Path("/proc/cpuinfo")
     if information.is_file():

@@ -1,8 +1,8 @@
-"""What each part of the hysteresis model brings: open loop in random order on simulations of several laws.
+"""What each part of the hysteresis model contributes: open loop, random order, simulations of several laws.
 
-Each seed is a simulation of its own, calibrated once by the plan HYSTERESIS; every model is made of the same maps.
-Requests are spheres of random curvature, each held for a dwell time of its own; the true surface is judged when the
-dwell ends. Models learn of the simulation only what the driver reports.
+Each seed is a simulation of its own, calibrated once by the plan HYSTERESIS; all models are fitted to the same maps.
+Requests are spheres of random curvature, each held for its own dwell time; the true surface is judged at the end of
+the dwell. The models know of the simulation only what the driver reports.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from studies.comparison.random_requests import CURVATURE_MAX, DWELLS
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
 from studies.comparison.true_surface import TrueSurface
 
-#: What precedes the requests. Tracked: all that the calibration did, and no degauss. Power cycle: off for a time in
-#: which creep goes on unseen, then a degauss.
-#: Conditioned: a degauss before each request, as recipes need it.
+#: What precedes the requests. Tracked: everything that the calibration did, and no degauss. Power cycle: power off for
+#: a time in which creep continues unobserved, then a degauss.
+#: Conditioned: a degauss before each request, as recipes require.
 TRACKED, DEGAUSSED, POWER_CYCLE, CONDITIONED = "tracked", "degaussed", "power cycle", "conditioned"
 HISTORIES = (TRACKED, DEGAUSSED, POWER_CYCLE)
-#: Hysteresis laws of the simulations; `mixed` is one that no candidate of the identification holds.
+#: Hysteresis laws of the simulations; `mixed` is a law that no candidate of the identification contains.
 PLANTS = ("prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
-#: The longest hold, from when its drift counts, and the curvature, s, s, 1/m.
+#: The longest hold, s; the time from which its drift counts, s; and its curvature, 1/m.
 HOLD_S, HOLD_FROM_S, HOLD_CURVATURE = 3600.0, 1.0, 0.03
 
 
@@ -75,7 +75,7 @@ def _prepare(bench: SimulatedBench, history: str, power_off: float) -> Simulated
 def _sequence(
     bench: SimulatedBench, variant: Variant, surface: TrueSurface, curvatures: Floats, dwells: Floats, limits: Floats
 ) -> tuple[Requests, float]:
-    """The requests in order, and then the drift of a shape held for an hour, m."""
+    """The outcome of the requests in order, and then the drift of a shape held for an hour, m."""
     mirror = DrivenMirror(bench, variant.loop, variant.holds, variant.book)
     targets = [FocusTarget(float(c)) for c in curvatures]
     upper, stands = [], []

@@ -1,4 +1,4 @@
-"""What an ablation measured, and the figures of it."""
+"""The outcome of an ablation, and its figures."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Requests:
     Attributes:
         dwell: (R,) s.
         curvature: (R,) 1/m.
-        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and the bound predicted beforehand.
-        rms, limit: (R,) m, sag error, and the best that this mirror could do.
+        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and its predicted bound.
+        rms, limit: (R,) m, sag error, and the smallest that this mirror could reach.
     """
 
     dwell: Floats
@@ -44,7 +44,7 @@ class Series:
     """One model on one plant after one history, all seeds together.
 
     Attributes:
-        hold_1h: (S,) m, drift of a shape held for an hour; of the seeds.
+        hold_1h: (S,) m, drift of a shape held for an hour, for each seed.
     """
 
     plant: str
@@ -56,7 +56,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Identified:
-    """What the calibration of one simulation found."""
+    """Result of the identification on one simulation."""
 
     plant: str
     seed: int
@@ -80,8 +80,8 @@ class RowFigures:
     Attributes:
         p50, p90: m, of the largest coefficient error.
         rms_share: median of rms sag error over PV.
-        excess_share: the same of what exceeds the fitting limit (root of the difference of squares).
-        bound_coverage: share of requests inside the bound predicted beforehand.
+        excess_share: the same for the part beyond the fitting limit (root of the difference of squares).
+        bound_coverage: share of requests whose error is inside the predicted bound.
     """
 
     requests: int

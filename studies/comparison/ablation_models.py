@@ -1,4 +1,4 @@
-"""The models of the ablation, from linear to recipes, each made of the maps of one calibration."""
+"""The models of the ablation, from linear to recipes, each fitted to the maps of one calibration."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from studies.comparison.compare import CURVATURES
 from studies.comparison.driven_mirror import build_recipes
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 
-#: `plays only` is the whole law, chosen among candidates without the Duhem operator.
+#: `plays only` is the whole law, but chosen among candidates without the Duhem operator.
 LINEAR, PLAYS, HYSTERESIS, CREEP, RECIPES = "linear", "plays only", "+ hysteresis", "+ creep", "+ recipes"
 MODELS = (LINEAR, PLAYS, HYSTERESIS, CREEP, RECIPES)
 
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A model of the mirror, whether it corrects shapes while they are held, and its recipes, if it goes by them."""
+    """A model of the mirror, whether it corrects shapes while they are held, and the recipes that it uses, if any."""
 
     name: str
     loop: Planner
@@ -32,10 +32,10 @@ class Variant:
 
 
 def make_variants(bench: SimulatedBench, calibration: Calibration) -> tuple[Variant, ...]:
-    """The models, each made of the maps of `calibration` alone.
+    """The models, each fitted to the maps of `calibration` alone.
 
     Raises:
-        ValueError: a recipe is beyond what the mirror reaches.
+        ValueError: a recipe is beyond the mirror's reach.
     """
     hysteresis = calibration.hysteresis
     assert hysteresis is not None
@@ -61,7 +61,7 @@ def _variant(
     mirror = CalibratedMirror(influence_model(fit, calibration.aperture_radius), bench.limits)
     if hysteresis is None:
         return Variant(name, Planner(mirror, slew_rate=bench.slew_rate), holds)
-    # A law without creep was not what the held-out maps tested: then its influence function's own figure counts.
+    # The held-out maps did not test a law without creep: then the figure of its influence function counts.
     held_out = hysteresis.held_out_max_zernike if hysteresis.law.creep_rate else fit.held_out_max_zernike
     figures = HysteresisFigures(hysteresis.law, held_out, hysteresis.unknown_sigma)
     return Variant(name, Planner(mirror, figures, bench.slew_rate), holds)

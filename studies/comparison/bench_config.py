@@ -1,4 +1,4 @@
-"""Which simulation, and how it is operated."""
+"""Parameters of a simulation and of its operation."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from dm_simulation.mirror.plate import PlateConfig
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """Which simulation, and how it is operated.
+    """Parameters of a simulation and of its operation.
 
     Attributes:
         law: hysteresis law, one of dm_simulation's.
         seed: of gains, figure and noise, and of laws that are drawn.
         hysteresis: loop opening as a share of the stroke.
         creep: per decade of time.
-        piezo, plate, instrument: everything else of the stacks, the plate and the interferometer; its camera apart.
-        pixels: the camera has pixels x pixels; a small one is quicker, its terms hardly noisier, for the low-order
-            noise of an interferometer does not average out.
+        piezo, plate, instrument: all other parameters of the stacks, the plate and the interferometer, not its camera.
+        pixels: the camera has pixels x pixels. A small one is quicker, and its terms are hardly noisier: the low-order
+            noise of an interferometer does not average out over pixels.
         samples: sampling points.
         settle_time: between command and map, s.
         exposure: one map takes this long, s.

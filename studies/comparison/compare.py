@@ -1,13 +1,12 @@
-"""All methods side by side on the same simulations: how near they bring a sweep of spheres, and what that costs.
+"""All methods side by side on the same simulations: their errors on a sweep of spheres, and their cost in time.
 
 Each seed is a simulation of its own, calibrated once by the full plan. Every method then starts from the same state
-of that simulation, noise to come included, rested by a degauss, and goes through the same spheres in the same random
-order. Open-loop rows take the solver's command as it is; closed-loop rows let the same solver correct it on the
-interferometer, and foresee creep by the rate that the maps of the calibration show.
+of that simulation, future noise included, after a degauss, and goes through the same spheres in the same random
+order. Open-loop rows use the solver's command as it is; closed-loop rows let the same solver correct it with the
+interferometer, and feed creep forward at the rate identified from the maps of the calibration.
 
-Errors are those of the true surface, which only a simulation knows: a loop that stops on its own measurement would
-otherwise be judged by the noise it stopped on. Curvature 0 has no peak to valley and does not count in the relative
-figures.
+Errors are those of the true surface, which only a simulation knows: otherwise a loop that stops on its own measurement
+would be judged by the noise it stopped on. Curvature 0 has no peak to valley and is left out of the relative figures.
 """
 
 from __future__ import annotations
@@ -40,9 +39,9 @@ from studies.solvers.steepest_descent import SteepestDescent
 
 #: Curvatures of the sweep, 1/m: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
-#: Added to the name of a method where it runs in the closed loop.
+#: Suffix of the name of a method in the closed loop.
 CLOSED = "_closed_loop"
-#: Methods older than [1]: their influence matrix is that of single pokes, without the surfaces of Table 1.
+#: Methods older than [1]: their influence matrix is from single pokes, without the surfaces of Table 1.
 CLASSICAL = (PseudoInverse.name, SteepestDescent.name)
 
 
@@ -113,15 +112,15 @@ class MethodFigures:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All rows, and what no method can undercut.
+    """All rows, and the limit for every method.
 
     Attributes:
         trials: every set-point.
-        fitting_limit: rms sag that the ideal command inside the limits leaves of the hardest sphere of the sweep, m;
+        fitting_limit: rms sag error of the ideal command inside the limits for the hardest sphere of the sweep, m;
             median over the seeds.
         fitting_limit_share: the same over PV, median over all spheres.
         radius: of the working aperture, m.
-        creep_rates: per decade, of each seed, identified from its calibration: what the loops foresee.
+        creep_rates: per decade, for each seed, identified from its calibration; the loops feed creep forward with it.
     """
 
     trials: tuple[Trial, ...]
@@ -156,7 +155,7 @@ def peak_to_valley(curvature: float, radius: float) -> float:
 
 @dataclass(frozen=True)
 class _MapInfo:
-    """What `surface_error` asks of a map."""
+    """The fields of a map that `surface_error` uses."""
 
     centre_x: float
     centre_y: float
@@ -172,9 +171,9 @@ def true_error(bench: SimulatedBench, target: FocusTarget) -> SurfaceError:
 
 
 def fitting_limits(bench: SimulatedBench, curvatures: Sequence[float]) -> Floats:
-    """(C,) rms sag error of the best possible displacements of this very mirror inside its stroke, m.
+    """(C,) rms sag error of the best possible displacements of this mirror inside its stroke, m.
 
-    Computed on the true influence functions and figure, without hysteresis, creep and noise.
+    Computed from the true influence functions and figure, without hysteresis, creep and noise.
     """
     influence, figure = bench.true_influence()
     rows, columns = np.nonzero(np.isfinite(bench.true_map()))
@@ -198,7 +197,7 @@ def fitting_limits(bench: SimulatedBench, curvatures: Sequence[float]) -> Floats
 
 
 def poke_model(calibration: Calibration) -> InfluenceModel:
-    """The influence function of the pokes and reference frames alone."""
+    """The influence function from the pokes and reference frames alone."""
     maps = calibration.maps.select(np.array([kind != StepKind.SURFACE for kind in calibration.maps.kind], dtype=bool))
     return influence_model(fit_influence(maps, FitOptions()), calibration.aperture_radius)
 
@@ -212,7 +211,7 @@ def region_weights_of(calibration: Calibration) -> Floats:
 
 
 def make_solvers(calibration: Calibration, limits: Limits, methods: Sequence[str]) -> dict[str, Solver]:
-    """The solvers, each on the influence function it would have."""
+    """The solvers, each with the influence function that it would have in use."""
     full = influence_model(calibration.fit, calibration.aperture_radius)
     pokes = poke_model(calibration) if any(name in CLASSICAL for name in methods) else full
     facts = MirrorFacts(calibration.actuator_x, calibration.actuator_y, region_weights_of(calibration))

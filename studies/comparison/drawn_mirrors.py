@@ -1,4 +1,4 @@
-"""Mirrors drawn at random, law and parameters too: what a seed stands for, and what happens to that mirror."""
+"""Mirrors drawn at random from a seed, with their hysteresis law, parameters, and what happens to them later."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dm_simulation.mirror.piezo import PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 from studies.comparison.simulated_bench import SimulationConfig
 
-#: Laws to draw from, and how often each comes.
+#: Laws to draw from, with their probabilities.
 LAWS = {
     "drawn_preisach": 0.3,
     "drawn_unlike": 0.15,
@@ -21,12 +21,12 @@ LAWS = {
 }
 #: Largest difference between neighbours as shipped, see pdm_driver's `limits.neighbour_difference`.
 SHIPPED_NEIGHBOUR_DIFFERENCE = 1.0
-#: Creep of few elements: first and last time constant, s, a decade apart.
+#: Creep of few elements, a decade apart: first and last time constant, s.
 FEW_ELEMENTS_S = (0.3, 300.0)
-#: What may happen after the calibration, and how often each does.
+#: What may happen after the calibration, with probabilities.
 GAIN_STEP, DIES, NOTHING = "gain step", "actuator dies", ""
 EVENTS = {NOTHING: 0.8, GAIN_STEP: 0.1, DIES: 0.1}
-#: Of a gain step.
+#: Relative change of all gains in a gain step.
 GAIN_STEP_SHARE = 0.002
 
 
@@ -46,11 +46,11 @@ class DrawnMirror:
 
     @property
     def changes(self) -> bool:
-        """Whether the mirror becomes another than the one that was calibrated."""
+        """Whether the mirror changes after its calibration."""
         return self.event != NOTHING
 
     def description(self) -> str:
-        """What it is, in one line."""
+        """The mirror in one line."""
         config, piezo, instrument = self.simulation, self.simulation.piezo, self.simulation.instrument
         parts = [
             config.law.removeprefix("drawn_").replace("_", "-"),
@@ -83,7 +83,7 @@ def draw_mirror(seed: int, pixels: int = 236) -> DrawnMirror:
     rng = np.random.default_rng([seed, 14])
 
     def sometimes(low: float, high: float) -> float:
-        """Between both for every other mirror, else 0."""
+        """Uniform between both for every other mirror, else 0."""
         value = float(rng.uniform(low, high))
         return value if rng.random() < 0.5 else 0.0
 

@@ -1,4 +1,4 @@
-"""A simulation that is driven as the suite drives a mirror: moves, holds against creep, follows what is reported."""
+"""A simulation driven as the suite drives a mirror: moves, holds against creep, and state estimates from reports."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from dm_controller.planning.recipes import Corrections, UnreachableError
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
 
-#: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
-#: experiment need not correct more often than it matters. The first ones come as the controller's do.
+#: Wait for the next correction of a held shape, as a share of the time since the move: creep slows down in proportion,
+#: and an experiment need not correct more often. The first corrections come at the controller's period.
 CORRECTION_GROWTH = 0.07
 
 
@@ -29,11 +29,11 @@ def build_recipes(
     curvatures: Iterable[float],
     on_map: Callable[[Measurement, SettledState], object] = lambda measured, settled: None,
 ) -> tuple[RecipeBook, list[str]]:
-    """Recipes of these curvatures, built on the bench as it stands, and why others of them could not be built.
+    """Recipes of these curvatures, built on the bench in its present state, and the refusals of the other curvatures.
 
     Args:
-        on_map: called with each map, and what stood at the mirror. What it changes of the calibration is in no
-            `by_model` of the recipes.
+        on_map: called with each map, and the effective signals at that time. Its changes of the calibration do not
+            enter `by_model` of the recipes.
     """
     tracker, history = HysteresisTracker(planner.law), AppliedHistory()
     history.follow(planner.law)
@@ -47,7 +47,7 @@ def build_recipes(
             history.observe(report)
         seen = len(bench.reports)
         assert bench.latest is not None
-        with suppress(MapNotUsableError):  # as the node, which goes on without such a map
+        with suppress(MapNotUsableError):  # the node, too, continues without such a map
             on_map(bench.latest, history.settled(bench.time, 0.0))
 
     options = BuildOptions(settle_time=bench.config.settle_time)
@@ -68,9 +68,9 @@ class DrivenMirror:
 
     Args:
         holds: whether shapes are corrected while they are held.
-        book: recipes to go by; each of their moves begins with a degauss.
-        seen: reports of the bench that the suite, started only later, has missed.
-        record: what the suite before it has left on disk.
+        book: recipes to use; each move by a recipe begins with a degauss.
+        seen: number of reports of the bench that the suite missed, because it was started only later.
+        record: creep record that the previous run of the suite left on disk.
     """
 
     def __init__(
@@ -111,19 +111,19 @@ class DrivenMirror:
         return other
 
     def settled(self) -> SettledState:
-        """What stands at the mirror now, as maps are compared with."""
+        """The effective signals now, with which maps are compared."""
         self._follow()
         state, law = self._tracker.state, self._planner.law
         assert state is not None
         return SettledState(law.effective(law.advance(state, self.bench.time)), self.bench.reports[-1].time)
 
     def record(self) -> CreepRecord | None:
-        """What the suite leaves on disk."""
+        """The creep record that the suite leaves on disk."""
         self._follow()
         return record_of(self._planner.law, self._tracker.state, self.bench.time)
 
     def plan(self, target: FocusTarget) -> Move:
-        """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""
+        """The move to `target` from the present state; with recipes, the mirror is degaussed first, and one is used."""
         effective, error = None, None
         if self._corrections is not None:
             found = self._corrections.find(target)
@@ -134,7 +134,7 @@ class DrivenMirror:
         return self._planner.plan(target, state, self.bench.time, known, effective, SETTLE_S, error)
 
     def go(self, move: Move) -> Move:
-        """Carry out `move`, whose prediction is made beforehand.
+        """Carry out `move`, which holds the prediction made beforehand.
 
         Raises:
             Refusal: the driver refuses it.
@@ -143,7 +143,7 @@ class DrivenMirror:
         return move
 
     def hold(self, move: Move, dwell: float) -> None:
-        """Let `dwell` s pass since the move, correcting what creep does."""
+        """Hold the shape of `move` for `dwell` s, with corrections against creep."""
         began = self.bench.time
         passed = PERIOD_S
         while self._holds and passed < dwell:

@@ -1,4 +1,4 @@
-"""What so many maps reach on mirrors drawn at random: the plan HYSTERESIS, and patterns that know no hysteresis."""
+"""Accuracy against number of maps on random mirrors: the plan HYSTERESIS, and patterns that ignore hysteresis."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from studies.comparison.random_requests import Requests, active_of, draw_targets
 from studies.comparison.simulated_bench import Floats, SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
-#: What is measured: random shapes whose hysteresis is identified, patterns of all actuators, one actuator at a time.
+#: Plans: random shapes to identify hysteresis, patterns of all actuators, one actuator at a time.
 HYSTERESIS, HADAMARD, PUSH_PULL = "hysteresis", "Hadamard", "push-pull"
 METHODS = (HYSTERESIS, HADAMARD, PUSH_PULL)
-#: Half-swing of a pattern; neighbours that go apart then keep the limit that ships.
+#: Half-swing of a pattern: neighbours that move in opposite directions stay within the shipped limit.
 HALF_SWING = 0.499
-#: Requests to each calibration, s that each is held, and m within which they should be: a two-hundredth of the
-#: wavelength.
+#: Number of requests to each calibration, s for which each is held, and m within which its error should be: a
+#: two-hundredth of the wavelength.
 REQUESTS, DWELL, GOAL = 20, 1.0, 632.8e-9 / 200
 
 
@@ -37,8 +37,8 @@ class FewMaps:
     """One calibration and how good it was.
 
     Attributes:
-        maps: that it was asked to take; plans of hysteresis add some at rest.
-        taken, seconds: what it took, from the degauss on, a degauss included.
+        maps: number requested; plans of hysteresis add some at rest.
+        taken, seconds: maps taken and duration, from the initial degauss on, which is included.
         failure: the reason why there are no requests; "" = there are.
     """
 
@@ -52,7 +52,7 @@ class FewMaps:
 
 
 def patterns(method: str, mirror: Mirror, count: int) -> Floats:
-    """(count, N) signals: each actuator pushed, then pulled at once; or each pattern pushed, then each pulled."""
+    """(count, N) signals: each actuator pushed, then pulled; or all Hadamard patterns pushed, then all pulled."""
     actuators = mirror.actuators
     if method == PUSH_PULL:
         both = np.eye(actuators).repeat(2, axis=0) * np.resize((1.0, -1.0), (2 * actuators, 1))
@@ -64,7 +64,7 @@ def patterns(method: str, mirror: Mirror, count: int) -> Floats:
 
 
 def plan_of(method: str, mirror: Mirror, maps: int) -> Plan:
-    """The plan with so many maps.
+    """The plan with this number of maps.
 
     Raises:
         TooFewMapsError, ValueError: a plan of hysteresis with too few or too many.

@@ -41,9 +41,9 @@ from studies.comparison.random_requests import (
 from studies.comparison.simulated_bench import SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
-#: A shape is held for so long before the electronics are switched off, for so long, s.
+#: Time for which a shape is held before the electronics are switched off, and time that they stay off, s.
 HELD_S, OFF_S = 86400.0, 600.0
-#: Requests after a restart, maps that then check the calibration, and requests by recipes for each recipe.
+#: Numbers of requests after a restart, of maps that then check the calibration, and of requests for each recipe.
 FIRST_REQUESTS, CHECK_MAPS, PER_RECIPE = 6, 3, 2
 
 Progress = Callable[[str], None]
@@ -68,15 +68,15 @@ class PopulationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one mirror did.
+    """Results for one mirror.
 
     Attributes:
-        law: what the calibration found.
+        law: name of the law that the calibration found.
         held_out: m, 95th percentile of the largest coefficient error that it predicted.
         curvatures: 1/m, range of spheres that was published.
         groups: requests by what preceded them: ANY_ORDER etc.
         failure: the reason why it could not be judged; "" = it was.
-        seconds: of processor time, of the calibration, and of everything.
+        seconds: processor time of the calibration, and of everything.
     """
 
     mirror: DrawnMirror
@@ -88,20 +88,20 @@ class Outcome:
     seconds: tuple[float, float] = (0.0, 0.0)
 
 
-#: Kinds of requests: from the calibration on, by recipes after a degauss, after a day's hold and a restart, then after
-#: maps that checked the calibration, after a power cut during a move.
+#: Kinds of requests: from the calibration on; by recipes after a degauss; after a day's hold and a restart; then after
+#: maps that checked the calibration; after a power cut during a move.
 ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT = "any order", "recipes", "restarted", "checked", "power cut"
 
 
 def held_for_a_day(bench: SimulatedBench, rng: np.random.Generator) -> None:
-    """What some mirrors went through before their calibration: a shape held for a day, then no power for a while."""
+    """History of some mirrors before their calibration: a shape held for a day, then no power for OFF_S."""
     bench.apply(rng.uniform(-0.5, 0.5) + rng.uniform(-0.4, 0.4, bench.mirror.actuators))
     bench.time += HELD_S
     bench.power_cycle(OFF_S)
 
 
 def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -> None:
-    """What happens to the mirror after its calibration."""
+    """Apply the event that happens to the mirror after its calibration."""
     if mirror.event == GAIN_STEP:
         bench.piezo.gain *= 1 + GAIN_STEP_SHARE
     elif mirror.event == DIES:
@@ -111,7 +111,7 @@ def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -
 def _restarted(
     bench: SimulatedBench, active: ActiveCalibration, off: float, record: CreepRecord | None
 ) -> DrivenMirror:
-    """Electronics off for `off` s, the suite started anew, with what it finds on disk, and a degauss."""
+    """Switch the electronics off for `off` s, restart the suite with the record that it finds on disk, and degauss."""
     bench.power_cycle(off)
     seen = len(bench.reports) - 1
     bench.degauss()
@@ -120,7 +120,7 @@ def _restarted(
 
 
 class _KeptTrue:
-    """A calibration that every map keeps true, as the node `calibration` does with those of checks and of recipes."""
+    """A calibration updated by every map, as the node `calibration` does with those of checks and of recipes."""
 
     def __init__(self, bench: SimulatedBench, calibration: Calibration, folder: str) -> None:
         self._bench, self._calibration = bench, calibration
@@ -129,7 +129,7 @@ class _KeptTrue:
         self.take = self._updates.take
 
     def active(self) -> ActiveCalibration:
-        """As it is now."""
+        """The calibration with the updates so far."""
         message = calibration_message(self._calibration, None, "mirror", 1.0)
         if (kept := self._updates.in_use) is not None and (kept.drift.revision or kept.drift.surprising):
             put_updates(message, kept, math.nan, [], self._updates.mirror_changed)
@@ -147,7 +147,7 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
 
 
 def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progress: Progress) -> Outcome:
-    """Calibrate and judge one mirror; what its maps show later is kept in `folder`.
+    """Calibrate and judge one mirror; the updates of its calibration by later maps are kept in `folder`.
 
     Raises:
         Refusal, ValueError: it cannot be calibrated, or no request can be drawn, planned or carried out.
@@ -185,7 +185,7 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progre
     if options.recipes:
         driven = driven.under(active.planner, active.calibration.creep_shown)
     groups[ANY_ORDER] = judge_requests(driven, active, surface, draw_targets(active, options.requests, rng), dwells)
-    # From there a move that a power cut ends.
+    # From there on, a move that is ended by a power cut.
     progress(f"seed {seed}: power cut")
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     short = np.resize(DWELLS[:4], FIRST_REQUESTS)

@@ -25,7 +25,7 @@ REACHABLE_TOLERANCE = 2e-8
 DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
 #: Largest curvature asked for, 1/m, and largest sum of added terms, m.
 CURVATURE_MAX, ADDED_MAX = 0.05, 3e-7
-#: Terms of a request with added ones.
+#: Number of terms added to every other request.
 ADDED_TERMS = 3
 
 
@@ -46,7 +46,7 @@ class Requests:
 
     @classmethod
     def none(cls, refusals: Sequence[str]) -> Requests:
-        """All were refused."""
+        """No outcome: all requests were refused."""
         return cls(np.empty(0), np.empty(0), np.empty(0), tuple(refusals))
 
     @property
@@ -60,7 +60,7 @@ class Requests:
 
 
 def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibration:
-    """What the focus controller makes of this message on `calibration`, and of `mirror_info` of the bench."""
+    """The focus controller's active calibration, from this message on `calibration` and `mirror_info` of the bench."""
     mirror, limits = bench.mirror, bench.limits
     info = MirrorInfo(
         name=mirror.name,
@@ -80,7 +80,7 @@ def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibrat
 
 
 def draw_targets(active: ActiveCalibration, count: int, rng: np.random.Generator) -> list[FocusTarget]:
-    """Spheres, and every other one with terms of orders 2 to 5 on top, inside the range that the calibration tells."""
+    """Spheres, every other one with terms of orders 2 to 5 on top, inside the reachable range of the calibration."""
     targets = []
     for number in range(count):
         added = np.zeros(len(TERMS))
@@ -107,7 +107,7 @@ def judge_requests(
     targets: Sequence[FocusTarget],
     dwells: Floats,
 ) -> Requests:
-    """Carry the requests out in order."""
+    """Carry out the requests in order, and judge the true surface after each dwell."""
     served, kept, upper, stands, refusals = [], [], [], [], []
     for target, dwell in zip(targets, dwells, strict=True):
         try:

@@ -1,7 +1,7 @@
 """The virtual bench in process: mirror, electronics and interferometer without sockets, files or waiting.
 
 Implements `dm_common.measurement.Bench`, so calibrations and closed loops on it run the code they run on hardware.
-What a seed stands for is the same as on the bench behind the sockets: gains, initial figure and noise.
+A seed determines the same as on the virtual bench behind sockets: gains, initial figure and noise.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from studies.comparison.bench_config import SimulationConfig
 
-#: Pixels of the instrument that speck counts are stated for.
+#: Pixels across the camera for which the numbers of specks are given.
 FULL_CAMERA = InterferometerConfig().pixels
 #: Shortest time between two reports of the driver during a degauss, s.
 REPORT_INTERVAL_S = 0.02
 
 
 class SimulatedBench:
-    """One simulation with its time, which only waits and maps advance.
+    """One simulation with a time of its own, which only moves, waits and maps advance.
 
     Raises:
-        ValueError: a configuration that makes no sense, naming the parameter.
+        ValueError: a configuration that is not valid, naming the parameter.
 
     Attributes:
         mirror: as the calibration knows it.
         limits: as solvers know it.
-        piezo: its actuators, which nothing but an experiment may touch.
+        piezo: its actuators, which only an experiment may touch.
         time: s since the start.
         maps: maps taken so far.
         latest: the last of them; None = none yet.
@@ -88,7 +88,7 @@ class SimulatedBench:
         self._written: Floats = self._drive.signals()
         self._turns = self._degausses = 0
         self._turned_at: Floats | None = None
-        #: Of the signals, 1/s.
+        #: Largest slew rate of the signals, 1/s.
         self.slew_rate = self._limiter.limits.slew_rate
         self.time = self._moved = 0.0
         self.maps = 0
@@ -101,7 +101,7 @@ class SimulatedBench:
         )
 
     def fork(self) -> SimulatedBench:
-        """A second bench in exactly this state, noise to come included, so that methods can be compared."""
+        """A second bench in exactly this state, future noise included, so that methods can be compared."""
         other = copy.copy(self)
         other._drive, other.piezo = copy.deepcopy(self._drive), copy.deepcopy(self.piezo)
         other._noise = copy.deepcopy(self._noise)
@@ -136,7 +136,7 @@ class SimulatedBench:
         return self._drive.signals()
 
     def power_cut(self, signals: Floats, share: float) -> None:
-        """Set off for `signals` (N,) and cut the power after `share` of the way."""
+        """Begin the move to `signals` (N,) and cut the power after `share` of its steps."""
         way = list(self._limiter.ramp(self._written, self._limiter.check_shape(signals)))
         self._follow(way[: round(share * len(way))])
 
@@ -158,7 +158,7 @@ class SimulatedBench:
         )
 
     def _follow(self, shapes: list[Floats], known: bool = True) -> None:
-        """Write a way, reporting as often as the driver does."""
+        """Write a sequence of shapes, reporting as often as the driver does."""
         reported = -REPORT_INTERVAL_S
         for shape in shapes:
             self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
@@ -260,7 +260,7 @@ class SimulatedBench:
         """Run a plan and fit it, as the node `calibration` does, and go back to mid range.
 
         Raises:
-            TooFewMapsError, Refusal, ValueError: as `Procedure` and `evaluate`.
+            TooFewMapsError, Refusal, ValueError: as `Procedure` and `dm_calibration.calibrator.calibrate`.
         """
         options = options or ProcedureOptions()
         plan = make_plan(kind, self.mirror, plan_options)

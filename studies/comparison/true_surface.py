@@ -15,7 +15,7 @@ from studies.comparison.simulated_bench import SimulatedBench
 
 
 class TrueSurface:
-    """Judges displacements of one simulation; for judging only."""
+    """Errors of the true surface for displacements of one simulation; for judging only."""
 
     def __init__(self, bench: SimulatedBench) -> None:
         self._influence, self._figure = bench.true_influence()
@@ -49,7 +49,7 @@ class TrueSurface:
         matrix = self._influence * self._stroke
         matrix = matrix - self._plane @ (self._plane.T @ matrix)
         box = Limits(self._limits.low, self._limits.high, self._limits.pairs, self._limits.neighbour_difference)
-        # What lies outside the span of the matrix no command reaches: small right-hand sides say the same.
+        # No command reaches the part outside the span of the matrix: the small projected problem has the same solution.
         axes, triangle = np.linalg.qr(matrix)
         programme = BoundedProgramme(triangle, box, ridge=1e-26 * len(matrix))
         misses = -self._difference(np.zeros((len(targets), matrix.shape[1])), targets)

@@ -1,7 +1,7 @@
-"""What `studies.documentation.answers` asks: right and wrong values of every service, action and command topic.
+"""Test cases of `studies.documentation.answers`: right and wrong values of every service, action and command topic.
 
-Values are as one types them for `ros2 service call` and `ros2 action send_goal`; `[37 x 0.0]` stands for so many, LONG
-for a text of 5000 characters, IN_USE and LAST_MAP for what only the run knows.
+Values are written as for `ros2 service call` and `ros2 action send_goal`. `[37 x 0.0]` means 37 such values, LONG a
+text of 5000 characters; IN_USE and LAST_MAP are names that only the run knows.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 from dm_msgs import action, msg, srv
 
-#: Of every request of a focus, where it stands in a field `request` or alone: of each field a wrong value.
+#: One wrong value of each field of a focus request, for interfaces that contain one in `request` or consist of one.
 _WRONG = (
     "curvature: .nan",
     "curvature: 0.5",
@@ -20,7 +20,7 @@ _WRONG = (
     "time_budget: -1.0",
     "header: {stamp: {sec: 1}}",
 )
-#: More of the same.
+#: More values of a focus request.
 _FOCUS = (
     *_WRONG,
     "curvature: .inf",
@@ -34,7 +34,7 @@ _FOCUS = (
     "time_budget: .nan",
     "time_budget: 1.0e+9",
 )
-#: Of a recipe that could be stored.
+#: Fields of a recipe that could be stored.
 _RECIPE = "effective: [37 x 0.0], signals: [37 x 0.0]"
 
 #: {interface: (type, values)}, in the order in which they are tried.

@@ -1,7 +1,7 @@
 """The section Answers of docs/interfaces.md, from a run (`python -m studies.documentation.answers`).
 
-Every case of `answer_cases` and `special_cases` is asked over ROS, one after another, of a calibrated mirror; the table
-holds code and sentence. What differs from run to run, names of files and measured figures, is an ellipsis.
+Every case of `answer_cases` and `special_cases` is tried over ROS, one after another, on a calibrated mirror; the table
+lists code and sentence. Whatever differs from run to run, names of files and measured figures, becomes an ellipsis.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from studies.documentation.answer_cases import CASES
 from studies.documentation.special_cases import BENCH, HELD, HOLD, MAP, TOPICS
 from studies.documentation.state_answers import SHOWN, Nodes
 
-#: Topics that carry commands: where their answers come.
+#: Topics that carry commands, with the topics and types of their answers.
 ANSWERED_ON = {"actuator_command": ("actuator_state", ActuatorState), "focus_request": ("focus_state", FocusState)}
-#: Figures of a refused answer that may be 0: what was asked for, is known all the same, or says by 0 that it is not.
+#: Figures that may be 0 in a refused answer: values of the request, values known anyway, and those where 0 = unknown.
 KNOWN = {"curvature", "power", "conic_constant", "dioptre", "duration", "gain_drift", "offset_drift"}
 KNOWN |= {"expected_max_zernike"}
 PATIENCE_S = 120.0
-#: How long focus is followed before that is cancelled, s.
+#: Time for which focus is tracked before that is cancelled, s.
 TRACK_S = 2.0
 TITLE = "## Answers\n"
-#: Codes whose sentences hold nothing that was measured.
+#: Codes whose sentences contain no measured figures.
 EXACT = (
     ErrorCode.INVALID_LENGTH,
     ErrorCode.NOT_FINITE,
@@ -49,12 +49,12 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
 
 @dataclass(frozen=True)
 class Answer:
-    """What one call was answered.
+    """The answer to one call.
 
     Attributes:
         name: of the interface.
         values: as typed.
-        code: ErrorCode; None = there is none, of parameters, of the bench and in logs.
+        code: ErrorCode; None = none, for parameters, the bench and lines of logs.
         message: as it came.
     """
 
@@ -64,7 +64,7 @@ class Answer:
     message: str
 
     def sentence(self) -> str:
-        """The message without what differs from run to run."""
+        """The message without the parts that differ from run to run."""
         text = re.sub(r"PDM30-37_\S+?Z|/\S+/(?:\S+\.dat\b)?|\S+\.dat\b", "…", self.message)
         text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
         text = re.sub(r"error is \S+ nm; nothing", "error is … nm; nothing", text)
@@ -89,7 +89,7 @@ def fill(message: Any, values: Mapping[str, Any]) -> Any:
 
 
 def parsed(values: str, names: Mapping[str, str]) -> dict[str, Any]:
-    """The mapping that `values` stands for; `names` holds what only the run knows."""
+    """Parse `values` to a mapping; `names` replaces the names that only the run knows."""
     for name, actual in names.items():
         values = values.replace(name, actual)
     values = re.sub(r"\[(\d+) x ([^\]]+)\]", lambda m: f"[{', '.join([m[2]] * int(m[1]))}]", values)
@@ -108,7 +108,7 @@ def zeros(message: Any) -> set[str]:
 
 
 class Asker(Connection):
-    """Calls every interface, see `Connection`."""
+    """Calls every interface; see `Connection`."""
 
     def __init__(self, domain: int | None) -> None:
         topics = {topic: (kind, qos.STATE) for topic, kind in ANSWERED_ON.values()}
@@ -138,7 +138,7 @@ class Asker(Connection):
         return Answer(name, values, code, answer.message)
 
     def tell(self, topic: str) -> Answer:
-        """Publish what is wrong on a topic with data until the node that it is for says so."""
+        """Publish wrong values on a topic with data until the receiving node reports them in its log."""
         kind, values, node = TOPICS[topic]
         messages = {name: part() for name, part in MAP.items() if topic in MAP}
         messages[topic] = fill(kind(), parsed(values, {}))
@@ -172,7 +172,7 @@ class Asker(Connection):
 
         publisher.publish(message)
         time.sleep(0.2)
-        self.wait(answers, 1.0)  # the first to come may be of before; one that goes on saying the same is the answer
+        self.wait(answers, 1.0)  # the first may be from before; one that keeps saying the same is the answer
         self.wait(lambda: topic in self.messages, 5.0)
         return self.messages.get(topic, before)
 
@@ -181,7 +181,7 @@ class Asker(Connection):
         accepted = client.send_goal_async(goal)
         self.wait(accepted.done)
         finished = accepted.result().get_result_async()
-        if getattr(goal, "track", False):  # it ends no other way
+        if getattr(goal, "track", False):  # tracking ends in no other way
             self.wait(finished.done, TRACK_S)
             accepted.result().cancel_goal_async()
         self.wait(finished.done, PATIENCE_S)
@@ -189,7 +189,7 @@ class Asker(Connection):
 
 
 def run() -> Iterator[Answer]:
-    """Every case, asked of a bench of this run's own."""
+    """Try every case on a bench of this run's own."""
     from dm_client import DeformableMirrorClient
     from dm_common.ros.domains import own_domain
     from dm_tools.demo.demo_bench import bench_config, running_bench
@@ -213,10 +213,10 @@ def run() -> Iterator[Answer]:
             try:
                 for name, (_, cases) in CASES.items():
                     yield from (asker.ask(name, values, names) for values in cases)
-                    time.sleep(0.2)  # a move that the last case began
+                    time.sleep(0.2)  # for a move that the last case began
                 yield asker.ask("hold_mirror", HOLD, names)
                 for name, cases in HELD.items():
-                    asker.ask("hold_mirror", HOLD, names)  # the last one took it over
+                    asker.ask("hold_mirror", HOLD, names)  # the last case took the mirror over
                     yield from (asker.ask(name, values, names) for values in cases)
                 nodes = Nodes(asker)
                 nodes.check_every_parameter()

@@ -1,6 +1,6 @@
 """docs/interfaces.md from the code (`python -m studies.documentation.interfaces`).
 
-Every node is made once, on a ROS domain of its own, and asked what it publishes, takes and serves; definitions come
+Every node is made once, on a ROS domain of its own, and asked for its topics, services and actions; definitions come
 from the installed dm_msgs, commands from the `dm` command itself.
 """
 
@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from studies.documentation.answers import PAGE, committed
 
-#: What rclpy gives every node, or every lifecycle node.
+#: Packages and topics of the interfaces that rclpy gives every node, or every lifecycle node.
 STANDARD = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces")
 STANDARD_TOPICS = ("rosout", "parameter_events")
 GRAPH_S = 20.0
@@ -54,7 +54,7 @@ with the value and the allowed range.
 | node | package | what it does |
 |---|---|---|
 """
-#: Longest line of text, but of tables.
+#: Longest line of text outside tables.
 LINE_MAX = 130
 #: What each node does.
 DUTIES = {
@@ -98,7 +98,7 @@ def type_name(cls: Any) -> str:
 
 
 def offers_of(node: Any) -> list[Offer]:
-    """What a node publishes, takes and serves beyond what every node does."""
+    """What a node publishes, subscribes to and serves, without the interfaces that every node has."""
     prefix = node.get_fully_qualified_name() + "/"
 
     def short(name: str) -> str:
@@ -140,7 +140,7 @@ def _actions(node: Any) -> list[tuple[str, str]]:
 
 
 def nodes_and_offers() -> dict[str, list[Offer]]:
-    """{node: its offers}; initialises ROS for good, hence for a process of its own."""
+    """{node: its offers}; ROS stays initialised, so this is for a process of its own."""
     import rclpy
 
     from dm_bringup.nodes import NODES
@@ -158,7 +158,7 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
         for entry in NODES:
             node = entry.load_class()()
             if entry.name in ("interferometer", "autofocus"):
-                node.trigger_configure()  # what they publish or hear comes with it
+                node.trigger_configure()  # this creates their topics
             result[entry.name] = offers_of(node)
             if hasattr(node, "make_safe"):
                 node.make_safe()
@@ -219,7 +219,7 @@ def _row(line: str) -> str:
 
 
 def commands() -> str:
-    """Every command of `dm` with its arguments and options, as Typer tells of them."""
+    """Every command of `dm` with its arguments and options, as documented by Typer."""
     import typer
     from typer.cli import get_docs_for_click
 
@@ -253,7 +253,7 @@ def interfaces_page() -> str:
 
 
 def wrapped(text: str) -> str:
-    """Text whose long lines one can read; rows of tables and blocks of code stay as they are."""
+    """Wrap long lines of text; rows of tables and blocks of code stay as they are."""
     return re.sub(r"(?ms)^```.*?^```$|^[^\n]+", lambda found: _wrapped(found[0]), text)
 
 

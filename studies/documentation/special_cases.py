@@ -1,4 +1,4 @@
-"""More of what `studies.documentation.answers` asks: of a mirror that is held, of the bench, of topics with data."""
+"""More test cases of `studies.documentation.answers`: of a mirror that is held, of the bench, of topics with data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dm_msgs import msg
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import SetBool, Trigger
 
-#: While somebody else holds the mirror, of every interface that moves it; {} = who asks.
+#: Values of every interface that moves the mirror, while another client holds it; {} = fields of the asking client.
 _HELD = {
     "set_signals": "signals: [37 x 0.0], {}",
     "actuator_command": "signals: [37 x 0.0], {}",
@@ -25,9 +25,9 @@ _HELD = {
     "autofocus": "{}",
     "focus_stack": "images: 12, {}",
 }
-#: Of these one run is enough.
+#: Long runs, for which one with `holder: me` is left out.
 _LONG_RUNS = ("calibrate", "converge", "build_recipes", "autofocus", "focus_stack")
-#: How `me` comes to hold it.
+#: The request by which `me` holds the mirror.
 HOLD = "operation: hold, holder: me, lease: 600.0"
 #: {interface: values}, in the order in which they are tried.
 HELD = {
@@ -39,13 +39,13 @@ HELD = {
     for name, values in _HELD.items()
 }
 
-#: Of the bench, as `answer_cases.CASES`.
+#: Cases of the bench, in the form of `answer_cases.CASES`.
 BENCH: dict[str, tuple[Any, tuple[str, ...]]] = {
     "virtual_bench/trigger": (Trigger, ("",)),
     "virtual_bench/power": (SetBool, ("data: false", "data: true")),
 }
 
-#: Topics with data: type, wrong values, and the node whose log says so. Messages of one map are taken together.
+#: Topics with data: type, wrong values, and the node that reports them. Messages of one map are taken together.
 TOPICS: dict[str, tuple[Any, str, str]] = {
     "image_raw": (Image, "encoding: rgb9, width: 4, height: 4", "autofocus"),
     "temperature": (Temperature, "temperature: 500.0", "calibration"),

@@ -1,4 +1,4 @@
-"""What nodes answer to new values of their parameters, and what those at rest answer: part of the section Answers."""
+"""Answers of nodes to new values of their parameters, and of nodes at rest: part of the section Answers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dm_common.ros.clients import call
 from dm_common.values import Value
 
 PATIENCE_S = 60.0
-#: Node, parameter and value: right ones, wrong ones, one that nobody knows, and those that wait for another state.
+#: Node, parameter and value: valid ones, wrong ones, an unknown one, and those that can be set only in another state.
 SHOWN: tuple[tuple[str, str, Any], ...] = (
     ("focus_controller", "reachable_tolerance", 3e-8),
     ("focus_controller", "reachable_tolerance", 1),
@@ -33,7 +33,7 @@ SHOWN: tuple[tuple[str, str, Any], ...] = (
     ("autofocus", "optics.rest_distance", 5.0),
     ("virtual_bench", "seed", 2),
 )
-#: What is asked of a node at rest.
+#: Requests to nodes at rest: node, service and type.
 AT_REST = (
     ("calibration", "list_calibrations", ListCalibrations),
     ("focus_controller", "set_focus", SetFocus),
@@ -42,7 +42,7 @@ AT_REST = (
 
 
 def _wrong(value: Value) -> Iterator[Any]:
-    """Of another type; where it is a number, beyond the largest, and NaN."""
+    """Wrong values: of another type; for numbers, also beyond the largest, and NaN."""
     yield 1.5 if value.kind is str else "nonsense"
     if value.kind in (int, float) and math.isfinite(value.high):
         yield value.item(2 * value.high + 1)
@@ -74,7 +74,7 @@ class Nodes:
         return "" if result.successful else result.reason
 
     def check_every_parameter(self) -> None:
-        """Give every parameter values that it may not have, and its own again.
+        """Set every parameter to wrong values, and then to its own again.
 
         Raises:
             AssertionError: an answer that does not name the parameter.
@@ -88,7 +88,7 @@ class Nodes:
                 request = GetParameters.Request(names=[name])
                 (now,) = self.ask(GetParameters, f"{node.name}/get_parameters", request).values
                 again = self._put(node.name, Message(name=name, value=now))
-                fixed = name in again and "read-only" in again and not parameter.live  # with the process
+                fixed = name in again and "read-only" in again and not parameter.live  # for the life of the process
                 assert not again or fixed, f"{node.name}: {name}: {again!r}"
 
     def change(self, node: str, transition: int) -> None:

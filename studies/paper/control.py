@@ -1,20 +1,20 @@
 """The control experiments of section 3.2: spheres and conics, started from the states p55 and p56.
 
 The paper starts from the measured surface c_ini and signals s_ini of p55 or p56 and solves Δc = GΔs for the way to the
-target. It leaves open when c_ini was measured. Both readings are run, and a closed loop beside them:
+target. It leaves open when c_ini was measured. Both readings are run, and a closed loop for comparison:
 
 - "stored": c_ini comes from the sample surfaces; no map is taken during control. This is open loop.
-- "measured": the mirror goes to p55 or p56, c_ini is measured there and then, and the mirror moves on from it: one map.
-- "closed loop": the stored start, then corrected on maps, three in all; creep is foreseen, and the last correction is
-  made but not measured.
+- "measured": the mirror goes to p55 or p56, c_ini is measured there, and the mirror moves on from it: one map.
+- "closed loop": the stored start, then corrected by maps, three in all; creep is fed forward, and the last correction
+  is made but not measured.
 
-An influence function of signals knows neither hysteresis nor creep. In two more readings a model of both stands beside
-it, see `hysteresis_control`:
+An influence function of signals knows neither hysteresis nor creep. In two more readings it is combined with a model
+of both, see `hysteresis_control`:
 
 - "stored with hysteresis": open loop as "stored"; no map is taken.
 - "closed loop with hysteresis": as "closed loop".
 
-Each method gets the same mirror in the same state, with the same noise to come.
+Each method gets the same mirror in the same state, with the same future noise.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from studies.solvers.registry import MirrorFacts, make_solver
 LINEAR_READINGS = ("stored", "measured", "closed loop")
 OPEN_HYSTERESIS, LOOP_HYSTERESIS = "stored with hysteresis", "closed loop with hysteresis"
 READINGS = (*LINEAR_READINGS, OPEN_HYSTERESIS, LOOP_HYSTERESIS)
-#: Maps of a closed loop.
+#: Number of maps of a closed loop.
 LOOP_MAPS = 3
 #: Pixels across a map that is kept for drawing.
 DRAWN_PIXELS = 160
@@ -89,8 +89,8 @@ class Shot:
         zernike: (21,) m, coefficient errors on that map.
         true_zernike: (21,) m, those of the noise-free surface, which only a simulation knows.
         rms: m, of the residual over all pixels.
-        overflow: how far the signals asked for lay outside the limits, normalised.
-        maps: taken during control, the judging one not counted.
+        overflow: how far the requested signals lay outside the limits, normalised.
+        maps: taken during control, without the one that judges it.
     """
 
     target: FocusTarget
@@ -249,7 +249,7 @@ def _shape(measured: Measurement, solver: Solver) -> Shape:
 
 
 def _judge(bench: SimulatedBench, target: FocusTarget, start: str, overflow: float, taken: int) -> Shot:
-    """Take a map of the surface as it now is and compare it with the target."""
+    """Take a map of the present surface and compare it with the target."""
     bench.time += bench.config.exposure
     sag = bench.take_map()
     aperture, radius = bench.aperture, bench.mirror.working_radius
@@ -265,7 +265,7 @@ def _judge(bench: SimulatedBench, target: FocusTarget, start: str, overflow: flo
 
 
 def _thinned(sag: Floats) -> NDArray[np.float32]:
-    """Every n-th pixel, such that no more than some DRAWN_PIXELS are left across."""
+    """Every n-th pixel, so that about DRAWN_PIXELS are left across."""
     step = max(1, round(len(sag) / DRAWN_PIXELS))
     return sag[::step, ::step].astype(np.float32)
 
@@ -273,7 +273,7 @@ def _thinned(sag: Floats) -> NDArray[np.float32]:
 def branch_spread(samples: Samples) -> float:
     """Largest coefficient difference of one command, p55, reached from the two ends of the range of curvature, m.
 
-    The p55 of the bench without hysteresis differs by noise only.
+    On the bench without hysteresis, the two p55 differ by noise only.
     """
     solver, bench = make_method("bounded programme", samples), samples.bench.fork()
     signals = samples.calibration.maps.applied[samples.row("p55")]

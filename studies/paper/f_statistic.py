@@ -1,4 +1,4 @@
-"""What F, the number of samples and the number of variables say together, to check published tables.
+"""Adjusted R^2 and p from F and the numbers of samples and variables, to check published tables.
 
 Table 2 in [1] gives adjusted R^2, F and p(F) without n and k. Only n = 50, k = 6 fits its AZreg and n = 49, k = 17
 its AZWreg.

@@ -1,9 +1,9 @@
-"""Control that follows hysteresis and creep through the commands, with what the product uses for it.
+"""Control that follows hysteresis and creep through the commands, with the modules that the suite uses for it.
 
 The law of all actuators is identified from the maps of the sample surfaces, and the influence function fitted to
 effective signals (:func:`~dm_calibration.hysteresis.hysteresis_fit.fit_hysteresis`). The tracker follows the state of
-the actuators from what the driver reports. A solver asks for effective signals; the controller's planner inverts the
-law, so that they stand when the next map is taken.
+the actuators from what the driver reports. A solver gives effective signals; the controller's planner inverts the law,
+so that they are reached when the next map is taken.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from studies.paper.samples import Samples
 
 @dataclass
 class Estimate:
-    """The surface error as far as maps and moves show it (a Kalman filter with one variance for all coefficients).
+    """Estimate of the surface error from maps and moves (a Kalman filter with one variance for all coefficients).
 
-    When a correction is hardly larger than the noise of a map, the map before it, carried on by the change that was
-    asked for, says as much as the map after it.
+    When a correction is hardly larger than the noise of a map, the map before it plus the commanded change is as good
+    a measurement as the map after it.
 
     Attributes:
-        noise: of a map, m, as the size of the largest coefficient.
-        error: measured less wanted, the best estimate; None before the first map.
-        variance: of it, m^2, in the same terms.
+        noise: standard deviation of the largest coefficient of a map, m.
+        error: best estimate of measured less wanted; None before the first map.
+        variance: of this estimate, for the largest coefficient, m^2.
     """
 
     noise: float
@@ -43,7 +43,7 @@ class Estimate:
 
         Args:
             measured: its error.
-            change: of the surface that was asked for since the last map; it may be missed by a share of MISS.
+            change: commanded change of the surface since the last map; its relative uncertainty is MISS.
         """
         if self.error is None:
             self.error, self.variance = measured, self.noise**2
@@ -74,7 +74,7 @@ class HysteresisControl:
         self._seen = 0
 
     def start(self, row: int, wanted: Shape) -> tuple[Floats, float]:
-        """Effective signals (N,) for a surface from what map `row` of the calibration showed; and the overflow."""
+        """Effective signals (N,) for the wanted surface from map `row` of the calibration, and their overflow."""
         effective = self._stored.applied[row]
         shown = measured_shape(self._stored.coefficients[row], self._stored.sag[row], self._solver.model)
         command = self._solver.correct(effective, shown - wanted)
@@ -97,7 +97,7 @@ class HysteresisControl:
         self._go(effective)
 
     def _go(self, effective: Floats) -> None:
-        """Move so that `effective` (N,) stands when the next map is taken, and let the mirror settle."""
+        """Move so that `effective` (N,) is reached when the next map is taken, and let the mirror settle."""
         bench = self._bench
         state = self._follow()
         ahead = bench.config.settle_time + bench.config.exposure

@@ -1,18 +1,18 @@
-"""What [1] leaves open of its regression (section 3.1), and the readings of it, with their Tables 2 and 3.
+"""The readings of the regression in section 3.1 of [1], which leaves some choices open, with their Tables 2 and 3.
 
 Fifty of the surfaces p01-p58 train the regression, eight test it. There are 37 signals and 21 coefficients. All of
 these readings are kept (:class:`Reading`):
 
 - LINEAR: [1] to the letter, the signals and the coefficients measured on the surface itself.
-- COMMAND: the signals and one candidate more, `model`: the norm of the error that figure and influence function in sag
-  predict. It needs no measurement and no history; it serves a controller that is about to move.
-- MEASURED: signals, measured coefficients, and `model` with the part inside the 21 terms from those, c - G s, and the
-  rest as COMMAND. It uses what [1] uses, but the surface must have been measured.
-- HISTORY: as COMMAND, but `model` follows the commands before this one too. This is the one that works, and the one
-  that the suite takes: see :mod:`dm_calibration.regression.surface_error`, also for what all of them share.
+- COMMAND: the signals and one more candidate, `model`: the norm of the error that figure and influence function in sag
+  predict. It needs no measurement and no history, so a controller can use it before a move.
+- MEASURED: signals, measured coefficients, and `model`, whose part inside the 21 terms comes from these, c - G s, and
+  whose rest is as in COMMAND. It uses what [1] uses, but the surface must have been measured.
+- HISTORY: as COMMAND, but `model` also follows the earlier commands. This reading works, and the suite uses it: see
+  :mod:`dm_calibration.regression.surface_error`, also for what is common to all of them.
 
-The eight test surfaces are in none of the fits that `model` comes from. LINEAR keeps the usual thresholds, as [1] seems
-to.
+No fit behind `model` contains any of the eight test surfaces. LINEAR keeps the usual thresholds, as [1] apparently
+does.
 """
 
 from __future__ import annotations
@@ -120,12 +120,12 @@ class LinearHistory:
     """A run without hysteresis: the influence function in sag with a constant figure."""
 
     def __init__(self, maps: MapSet, model: Floats) -> None:
-        """`model`: (M, P) m, sag to fill points without data from."""
+        """`model`: (M, P) m, sag that replaces points without data."""
         self._usable, self._sag = complete_sag(maps, model)
         self._design = np.column_stack((np.ones(len(maps)), maps.applied))
 
     def predict(self, keep: NDArray[np.bool_]) -> Floats:
-        """(M, P) m: sag of every command of the run, by the model that explains the maps in `keep` (M,) best."""
+        """(M, P) m: sag of every command of the run, by the model that best explains the maps in `keep` (M,)."""
         keep = keep & self._usable
         return np.asarray(self._design @ np.linalg.lstsq(self._design[keep], self._sag[keep], rcond=1e-9)[0])
 
@@ -143,7 +143,7 @@ def regress_surface_errors(
         maps: the raw data of a calibration.
         fit: its influence function; the method AZWreg makes the regression a weighted one.
         options: thresholds; None = those of the module's docstring.
-        test_set: surfaces to predict and never to train on; those not measured are passed over. Empty: all train.
+        test_set: surfaces to predict and never to train on; those not measured are ignored. Empty: all train.
 
     Raises:
         UnknownNameError: a name that is not one of p01-p58.
@@ -216,7 +216,7 @@ def _candidates(
     if reading is not Reading.MEASURED:
         return (MODEL, *signals), np.column_stack((rms(held_out, maps.points.weight), errors.signals))
     inside = (measured - errors.signals @ fit.influence_zernike.T)[:, 3:] * TERM_RMS[3:]
-    # Terms and points are orthogonal in the weighted sum, but for the discreteness of the points.
+    # The terms are orthogonal in the weighted sum over the points, except for the discreteness of the points.
     root = np.sqrt(maps.points.weight)
     orthogonal = np.linalg.qr(root[:, np.newaxis] * basis(maps.points.x, maps.points.y))[0]
     beyond = root * held_out

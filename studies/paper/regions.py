@@ -18,12 +18,12 @@ from dm_common.optics.zernike import MAX_ORDER
 
 #: Surfaces that are left out of the mean of Fig. 5(b) in [1]: Z_2^0 and Z_2^2.
 OUTSIDE_MEAN = ("pz02", "pz03")
-#: Pixels of the blocks in which a map is worked through: 0.5 MB.
+#: Pixels of the blocks in which a map is processed: 0.5 MB.
 _BLOCK_PIXELS = 2**16
 
 
 def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
-    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
+    """(R,) shares of the area as an array; ValueError unless they increase, from above 0 to at most 1."""
     fractions = np.asarray(area_fractions, dtype=float)
     if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
         raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
@@ -69,10 +69,10 @@ def row_spans(
     """First column and column after the last of the pixels inside, for each row of a map.
 
     The same pixels as ``squared_distance(aperture, shape) <= area_fraction``, without visiting each: the square root is
-    only a guess, which that very comparison settles at the columns beside it.
+    only a first guess, which the same comparison corrects among the neighbouring columns.
 
     Args:
-        area_fraction: of the concentric disc that is meant.
+        area_fraction: of the concentric disc.
 
     Returns:
         Two of (height,); equal where a row has no pixel inside.
@@ -118,7 +118,7 @@ class ConcentricRegions:
             columns[:, rings + k - 1] = np.minimum(columns[:, rings + k - 1], columns[:, rings + k])
         columns = np.maximum.accumulate(columns, axis=1)
         ring = np.concatenate([np.arange(rings)[::-1], np.arange(1, rings + 1)])
-        # Blocks of rows, so that what is made of a block stays in the processor's cache.
+        # Blocks of rows, so that the intermediate arrays of a block stay in the processor's cache.
         size = max(_BLOCK_PIXELS // shape[1], 1)
         self._blocks = [
             (slice(start, start + size), *_pieces(columns[start : start + size], ring, shape[1]))

@@ -16,7 +16,7 @@ from studies.paper.readings import Reading, ReadRegression, regress_surface_erro
 from studies.paper.reported import MODELS, TEST_SURFACES
 from studies.paper.samples import Samples
 
-#: The reading that the tables of the page are made of; the others stand beside it.
+#: The reading used for the tables of the page; the others are shown for comparison.
 TAKEN = Reading.HISTORY
 #: Significance level of the paper (section 3.1).
 LEVEL = 0.05
@@ -28,8 +28,8 @@ class Regressions:
 
     Attributes:
         by_reading: the regression of each model in each reading.
-        shuffled_p: (B,) p(F) of the plain linear reading on responses shuffled among the training surfaces; of honest
-            p values a share of LEVEL would be below LEVEL.
+        shuffled_p: (B,) p(F) of the plain linear reading on responses shuffled among the training surfaces; of
+            unbiased p values, a share of LEVEL would be below LEVEL.
         linear_left_out: (n,) m, absolute error of each training surface, predicted by the plain linear reading of AZreg
             from a model selected without it; with their names in `training`.
     """
@@ -60,7 +60,7 @@ def regress_samples(samples: Samples, shuffles: int = 0, seed: int = 0) -> Regre
     """Both models in all readings.
 
     Args:
-        shuffles: of the responses, to see what selection makes of chance.
+        shuffles: number of shuffles of the responses, which show what selection finds by chance.
         seed: of the shuffles.
     """
     maps = samples.calibration.maps

@@ -1,4 +1,4 @@
-"""What the paper itself reports, as numbers with their place in it.
+"""Values that the paper itself reports, with their place in it.
 
 Source: [1]. Lengths in nm, as printed.
 """
@@ -8,16 +8,16 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import NamedTuple
 
-#: Section 2.1, m.
+#: Wavelength, section 2.1, m.
 WAVELENGTH = 632.8e-9
-#: Section 3.1: the eight surfaces kept from the regression.
+#: Section 3.1: the eight surfaces that were kept out of the regression.
 TEST_SURFACES = ("p04", "p09", "p16", "p34", "p44", "p47", "p51", "p55")
 #: The two models, in the order of Tables 2 and 3.
 MODELS = ("AZWreg", "AZreg")
 
 
 class Significance(NamedTuple):
-    """A column of Table 2; n and k are not printed there, but the only small integers its figures agree with."""
+    """A column of Table 2; n and k are not printed there: they are the only small integers that fit its figures."""
 
     adj_r2: float
     f: float
@@ -59,7 +59,7 @@ TABLE_3 = MappingProxyType(
 FIG_5A_VARIANCE_NM2 = MappingProxyType({10: 12.34, 100: 25.68})
 #: Section 2.2, on Fig. 5(b): range of the variances over nine Zernike surfaces, nm^2.
 FIG_5B_VARIANCE_NM2 = (1.00, 1.33)
-#: Section 3.2: the residual Zernike coefficients are said to fall from the first to the second, parts of a wavelength.
+#: Section 3.2: the residual Zernike coefficients are said to fall from λ/50 to λ/1000; parts of the wavelength.
 CLAIM_PARTS = (50, 1000)
 #: Section 3.2: curvatures of the spheres, 1/m.
 CURVATURE_RANGE = (-0.05, 0.05)

@@ -1,4 +1,4 @@
-"""Everything that the page shows, measured: the standard bench, ideal actuators beside it, and further simulations."""
+"""All that the page shows, measured: on the standard bench, with ideal actuators, and on further simulations."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from studies.paper.samples import Samples, measure_samples
 from studies.paper.sampling_study import SamplingStudy, study_samples
 
 STANDARD, IDEAL = "standard bench", "ideal actuators"
-#: Hysteresis laws that the play operators of the regression do not hold as a special case.
+#: Hysteresis laws that the play operators of the regression do not contain as a special case.
 FOREIGN_LAWS = ("preisach", "bouc_wen")
-#: Methods that the aspheres are controlled by.
+#: Methods by which the aspheres are controlled.
 ASPHERE_METHODS = ("AZreg", "AZWreg")
-#: Method that the spheres are controlled by on simulations of foreign laws.
+#: Method by which the spheres are controlled on simulations of foreign laws.
 LAW_METHOD = "AZreg"
 #: Readings on each bench: ideal actuators have no hysteresis.
 READINGS_ON = MappingProxyType({STANDARD: READINGS, IDEAL: LINEAR_READINGS})
@@ -46,7 +46,7 @@ class PaperOptions:
         bench: the standard bench, its seed included.
         spheres: number of spheres over the range of curvature.
         seeds: number of further simulations for Table 3, with the seeds that follow the bench's; with small cameras.
-        shuffles: of the responses of the regression.
+        shuffles: number of shuffles of the regression's responses.
         foreign_laws: whether Table 3 and the spheres are tried on other hysteresis laws too.
     """
 
@@ -66,7 +66,7 @@ class PaperOptions:
 
     @classmethod
     def full(cls, seed: int) -> PaperOptions:
-        """The run that the page is meant for."""
+        """The full run, from which the page is made."""
         return cls(SimulationConfig(seed=seed, pixels=944))
 
     @classmethod
@@ -90,8 +90,8 @@ class BenchResults:
     Attributes:
         spheres: by method and reading.
         aspheres: by method, in the reading "measured".
-        branch_spread: m, see there.
-        limit_rms: m, least rms sag error of the strongest sphere that the model permits inside the limits.
+        branch_spread: m, see :func:`~studies.paper.control.branch_spread`.
+        limit_rms: m, smallest rms sag error of the strongest sphere that the model predicts inside the limits.
     """
 
     samples: Samples
@@ -104,7 +104,7 @@ class BenchResults:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All of it.
+    """Results of all experiments.
 
     Attributes:
         benches: STANDARD and IDEAL.
@@ -112,7 +112,7 @@ class Results:
         over_seeds: (B, S) RelErr of the test surfaces on them, by model.
         over_laws: (S,) the same on one simulation of each foreign law, by law and model.
         law_spheres: the spheres by LAW_METHOD on such simulations, by law and reading.
-        sampling: errors of ways to sample a map, on the standard bench.
+        sampling: errors of the ways to sample a map, on the standard bench.
     """
 
     options: PaperOptions

@@ -1,4 +1,4 @@
-"""The sample surfaces of Table 1 measured on a simulation, and what sections 2.2 and 3.1 of the paper need of them."""
+"""The sample surfaces of Table 1 measured on a simulation, and the quantities that sections 2.2 and 3.1 derive."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms, residual_map
 from studies.paper.weights_cancel import weights_cancel_max_abs
 
-#: Ways to read Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
+#: Readings of Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
 #: once over the whole aperture; and over the points with every region levelled on its own.
 POINTS, PIXELS, LEVELLED = "sampling points", "every pixel", "sampling points, each region levelled"
-#: Surfaces that tell “the degree of linearity of control” (section 2.1): the signal of channel 1 differs, and the
+#: Surfaces that measure “the degree of linearity of control” (section 2.1): the signal of channel 1 varies, and the
 #: others share it (p01–p05) or stay.
 LINEAR = {f"{names[0]}–{names[-1]}": names for names in (TABLE_1[:5], TABLE_1[45:54])}
-#: Maps of a mirror at rest that tell the noise of one.
+#: Number of maps of a mirror at rest from which the noise of one map is found.
 REPEATS = 20
-#: Creep has come to rest after so long, s.
+#: Time after which creep has come to rest, s.
 LONG_REST = 1e4
 
 
 class Linearity(NamedTuple):
-    """How straight the sag runs with the signal, in the terms of the maps beyond tilt.
+    """Linearity of the sag in the signal, by the terms of the maps beyond tilt.
 
     Attributes:
         rate: m rms per unit signal, change of the sag along the best straight line.
@@ -64,9 +64,9 @@ class Samples:
         labels: (M,) names of the sample surfaces.
         regional: (M, 10) m, rms surface control error inside the regions.
         actuator_surfaces, zernike_surfaces: panels (a) and (b) of Fig. 5.
-        readings: (a) of Fig. 5 by the way it is read, see POINTS, PIXELS, LEVELLED; without PIXELS unless asked for.
+        readings: panel (a) of Fig. 5 by reading, see POINTS, PIXELS, LEVELLED; PIXELS only if requested.
         weighting: Eq. (8) with the epsilon of the cross-validation.
-        median_weights: (10,) Eq. (8) with epsilon = the median variance, where weights act in full.
+        median_weights: (10,) Eq. (8) with epsilon = the median variance, where weights have their full effect.
         weights_cancel: m per unit signal, largest change of G when Eq. (7) replaces Eq. (6).
         influence_max: m per unit signal, largest entry of G, to compare it with.
     """
@@ -89,9 +89,9 @@ class Samples:
 
     @cached_property
     def noise(self) -> float:
-        """Median over repeated maps of a mirror at rest of the largest coefficient's deviation from their mean, m.
+        """Noise of one map, m: median over repeated maps of the largest coefficient's deviation from their mean.
 
-        No controlled surface can be shown by one map to be better than this.
+        The mirror is at rest. No controlled surface can be shown by one map to be better than this.
         """
         bench = self.bench.fork()
         bench.apply(bench.mirror.rest)
@@ -105,10 +105,10 @@ class Samples:
     def hysteresis(self) -> HysteresisFit:
         """The hysteresis and creep of the actuators, identified from the maps of the calibration.
 
-        One law for all actuators: the sample surfaces turn single actuators too rarely for laws of their own.
+        One law for all actuators: in the sample surfaces, single actuators reverse too rarely for laws of their own.
 
         Raises:
-            ExcitationError: the maps do not show them.
+            ExcitationError: the maps do not determine them.
         """
         return fit_hysteresis(self.calibration.maps, COMMON)
 
@@ -119,7 +119,7 @@ class Samples:
 
     @cached_property
     def linearity(self) -> dict[str, Linearity]:
-        """By group of LINEAR."""
+        """Linearity by group of LINEAR."""
         return {group: self._linearity(labels) for group, labels in LINEAR.items()}
 
     def _linearity(self, labels: Sequence[str]) -> Linearity:
@@ -138,7 +138,7 @@ class Samples:
 
 
 class _MapKeepingBench(SimulatedBench):
-    """Keeps the latest map of each sample surface, in single precision: rounding is some 1e-13 m."""
+    """Keeps the latest map of each sample surface, in single precision: the rounding error is some 1e-13 m."""
 
     def __init__(self, config: SimulationConfig) -> None:
         super().__init__(config)
@@ -162,7 +162,7 @@ def measure_samples(
     """Measure Table 1 on a new simulation, with the pokes and reference frames of a full calibration, and judge them.
 
     Args:
-        every_pixel: judge the regions of Fig. 5 on all pixels too; all maps of them are in memory meanwhile.
+        every_pixel: judge the regions of Fig. 5 on all pixels too; all maps of them are kept in memory meanwhile.
 
     Raises:
         TooFewMapsError, ValueError: as the calibration and the region weights do.
@@ -208,7 +208,7 @@ def _on_every_pixel(bench: _MapKeepingBench, surfaces: MapSet, influence: Floats
 
 
 def _cancel(surfaces: MapSet) -> float:
-    """Changes from the first sample surface, and weights that differ a hundredfold from row to row."""
+    """`weights_cancel` of :class:`Samples`, for weights that rise a hundredfold from the first to the last row."""
     delta_c = (surfaces.coefficients[1:] - surfaces.coefficients[0]).T
     delta_s = (surfaces.applied[1:] - surfaces.applied[0]).T
     return weights_cancel_max_abs(delta_c, delta_s, np.geomspace(0.01, 1.0, len(delta_c)))

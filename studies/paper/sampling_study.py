@@ -1,18 +1,18 @@
 """How far 21 coefficients depend on where a map is sampled: edge-clustered and uniform points against every pixel.
 
 The paper (section 2.2) fits 500 edge-clustered points instead of some 700 000 pixels and cites [5] for less
-ringing at the edge than with uniform points. Three errors tell the ways of sampling apart:
+ringing at the edge than with uniform points. Three errors distinguish the ways of sampling:
 
 * bias: content beyond the 21 terms leaks into them, since the terms are orthogonal over the disc but not over points;
   and the plain mean of four neighbours is the sag up to half a pixel from the point;
 * noise: of a pixel, averaged over four neighbours at each point, or over all pixels;
-* ringing at the rim: where the fitted terms leave the best ones. It is the bias seen where polynomials are steepest.
+* ringing at the rim: the deviation of the fitted terms from the best ones, that is the bias where polynomials are
+  steepest.
 
-Plain least squares over edge-clustered points counts the rim several times over: it follows the surface there better
-than any other way, and the 21 coefficients of the whole aperture worse. Weighted by the areas the points stand for, the
-same points give the least bias of all ways with as few samples.
-
-Every fit is linear in the map, so bias is measured on maps without noise and noise on maps without a surface.
+Plain least squares over edge-clustered points counts the rim several times: it follows the surface there better than
+any other way, and gives worse coefficients of the whole aperture. Weighted by the areas that they represent, the same
+points give the least bias of all ways with as few samples. Every fit is linear in the map, so bias is measured on maps
+without noise and noise on maps without a surface.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from dm_simulation.interferometer.interferometer import InterferometerConfig
 from studies.paper.regions import residual_map, squared_distance
 from studies.paper.samples import Samples
 
-#: Of the surfaces of Table 1 every so many are studied: pokes, spheres and Zernike surfaces among them.
+#: Every STRIDE-th surface of Table 1 is studied: pokes, spheres and Zernike surfaces are among them.
 STRIDE = 6
-#: Noise maps of the study on simulated surfaces.
+#: Number of noise maps of the study on simulated surfaces.
 DRAWS = 10
-#: The rim is the outermost share of the aperture's area.
+#: Share of the aperture's area, outermost, that counts as the rim.
 RIM_SHARE = 0.1
 
 
@@ -62,9 +62,9 @@ class SamplingResult:
         bias: (21,) systematic error of each coefficient, rms over the surfaces.
         noise: (21,) standard deviation of each coefficient by pixel noise.
         bias_rms, noise_rms: the same as rms sag over the disc, piston and tilt left out.
-        rim_ringing_rms, rim_ringing_peak: fitted 21 terms less the true ones on the rim: rms over rim and surfaces, and
-            the largest absolute value.
-        rim_error_rms: surface less fitted terms on the rim; it holds what no 21 terms can follow.
+        rim_ringing_rms, rim_ringing_peak: fitted less true 21 terms on the rim: rms over rim and surfaces, and
+            largest absolute value.
+        rim_error_rms: surface less fitted terms on the rim, including what the 21 terms cannot follow.
     """
 
     name: str
@@ -85,7 +85,7 @@ class SamplingStudy:
     Attributes:
         results: by name: "full map", "edge-clustered", "edge-clustered, area-weighted", "uniform".
         surfaces: number of surfaces.
-        beyond_rms: rms sag that the true 21 terms leave, over the surfaces, m.
+        beyond_rms: rms sag beyond the true 21 terms, over the surfaces, m.
         pixel_noise: m.
         draws: number of noise maps.
     """
@@ -115,7 +115,7 @@ def study_sampling(
         pixel_noise: standard deviation of white noise per pixel, m.
         rng: draws noise and dropouts.
         truth: (S, 21) coefficients that count as true, m; None = the fit to all pixels of the noise-free surface before
-            dropouts, against which the full map has no bias but that of the dropouts.
+            dropouts: the only bias of the full map is then that of the dropouts.
         dropout: share of pixels lost at random, 0 to below 1.
         draws: noise maps, at least 2.
         count: sampling points, at least as many as terms.
@@ -170,13 +170,13 @@ def study_sampling(
 
 
 def _ways(kept: NDArray[np.bool_], aperture: Aperture, count: int) -> dict[str, tuple[Callable[[Floats], Floats], int]]:
-    """Per way of sampling: the fit (map -> 21 coefficients) and the number of samples it rests on."""
+    """For each way of sampling, the fit (map -> 21 coefficients) and the number of samples that it uses."""
     where = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
     full = MapFitter(kept, *where)
     clustered, uniform = edge_clustered_points(count), uniform_points(count)
 
     def at(points: SamplePoints, weight: Floats) -> tuple[Callable[[Floats], Floats], int]:
-        # Noise and surface are lost at the same pixels, so one operator serves all maps.
+        # Noise and surface maps lack the same pixels, so one operator serves all of them.
         seen = np.isfinite(sample_map(np.where(kept, 0.0, np.nan), *where, points))
         if seen.sum() < len(TERMS):
             raise ValueError(f"{seen.sum()} sampling points with data for {len(TERMS)} terms: lower dropout")
@@ -212,9 +212,9 @@ def _check(surfaces: Floats, pixel_noise: float, truth: Floats | None, dropout: 
 
 
 def study_samples(samples: Samples) -> SamplingStudy:
-    """Set surfaces of Table 1 on a copy of the simulation and sample the noise-free maps of them in all ways.
+    """Set surfaces of Table 1 on a copy of the simulation and sample their noise-free maps in all ways.
 
-    The pixel noise is the instrument's; the noise draws follow from the simulation's seed.
+    The pixel noise is the instrument's; the draws of noise follow from the simulation's seed.
     """
     bench = samples.bench.fork()
     surfaces = []

@@ -1,4 +1,4 @@
-"""Eq. (7) against Eq. (6) in [1]: weights on the rows of dC - G dS change nothing while G is free."""
+"""Eq. (7) against Eq. (6) in [1]: weights on the rows of dC - G dS have no effect while all of G is free."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ RANK_TOLERANCE = 1e-7
 
 
 def weights_cancel_max_abs(delta_c: Floats, delta_s: Floats, weights: ArrayLike) -> float:
-    """Largest difference between the G of Eq. (7), weights on the rows, and the G of Eq. (6): rounding, no more.
+    """Largest difference between the G of Eq. (7), with weights on the rows, and the G of Eq. (6): only rounding.
 
-    Eq. (7) is solved as one problem in all K N unknowns of G at once, with no use of its rows being independent.
+    Eq. (7) is solved as one problem in all K N unknowns of G at once, without using the independence of its rows.
 
     Args:
         delta_c: (K, M) changes of the coefficients, m.

@@ -1,1 +1,1 @@
-"""Solvers that exist to be compared with those of the controller."""
+"""Solvers that serve only for comparison with those of the controller."""

@@ -83,9 +83,9 @@ def plate_influence(at: Floats, actuators: Floats, properties: PlateProperties) 
 class PlateModel(Solver):
     """Δs from the analytic solution of a simplified mechanical model ([1], introduction, its reference 22).
 
-    Needs no influence function, only where the actuators are and one number, the stroke, taken from the calibration as
-    the scale that fits best. The figure of the unpowered mirror is unknown to mechanics and stays in an open-loop
-    surface; so does every actuator's own gain ("the surface shape residual is not corrected", section 1).
+    Needs no influence function, only the positions of the actuators and one number, the stroke: the best-fitting scale
+    to the calibration. The model knows neither the figure of the unpowered mirror nor the gain of each actuator, so
+    their errors stay in an open-loop surface ("the surface shape residual is not corrected", section 1).
     """
 
     name = "plate_model"

@@ -20,7 +20,7 @@ from studies.solvers.steepest_descent import SteepestDescent
 
 @dataclass(frozen=True, eq=False)
 class MirrorFacts:
-    """What some methods need beside the influence function.
+    """Facts that some methods need beside the influence function.
 
     Attributes:
         actuator_x, actuator_y: (N,) m; None = unknown.
@@ -43,7 +43,7 @@ _ORDER = (
     "AZWreg",
     "bounded",
 )
-#: In the order of [1].
+#: All solvers by name, in the order of [1].
 SOLVERS = {name: _COMPARED[name] for name in sorted(_COMPARED, key=_ORDER.index)}
 
 
@@ -57,7 +57,7 @@ def make_solver(name: str, model: InfluenceModel, limits: Limits, facts: MirrorF
 
     Raises:
         UnknownNameError: no such method, listing all.
-        ValueError: the model, or what is known of the mirror, does not do for the method.
+        ValueError: the model, or the facts known of the mirror, are not sufficient for the method.
     """
     facts, solver = facts or MirrorFacts(), SOLVERS[check_method(name)]
     if solver is PlateModel:

@@ -10,8 +10,8 @@ from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
 
-#: What a unit of coefficient error (in units of the strongest pattern) costs against a unit of θ. An L1 penalty is
-#: exact: above a certain price the coefficients are met to the last digit whenever the limits permit.
+#: Cost of a unit of coefficient error (in units of the strongest pattern) relative to a unit of θ. An L1 penalty is
+#: exact: above a certain price the coefficients are met exactly whenever the limits permit.
 ERROR_PRICE = 1e4
 
 
@@ -37,7 +37,7 @@ class SparseSampling(Solver):
         if not singular[0] > 0.0:
             raise ValueError("influence_sag is zero: no actuator moves the surface; calibrate first")
         self._scale = singular[0]
-        #: (N, J) the patterns, columns in signals per unit of θ.
+        #: (N, J) the patterns in columns, in signals per unit of θ.
         used = singular > 1e-6 * singular[0]
         self.patterns: Floats = right[used].T * (singular[0] / singular[used])
         count, actuators = self.patterns.shape[1], self.patterns.shape[0]
@@ -58,7 +58,7 @@ class SparseSampling(Solver):
         self._sizes = (count, actuators)
 
     def _room(self, start: Floats) -> Floats:
-        """Right-hand side of the inequalities: how far each signal and difference may still go up, then down."""
+        """Right-hand side of the inequalities: by how much each signal and difference may still rise, then fall."""
         limits = self.limits
         up, down = limits.high - start, start - limits.low
         if self._neighbours:
@@ -70,7 +70,7 @@ class SparseSampling(Solver):
     def theta(self, start: Floats, change: Shape) -> Floats:
         """(J,) the sparse θ of Eq. (4) for `change`, from the signals `start` (N,)."""
         wanted = self._factors * change.coefficients[PISTON_TILT:] / self._scale
-        # The programme in units of its own answer, else the solver's absolute tolerances would cut small corrections.
+        # Scaled to its own answer: otherwise the solver's absolute tolerances would cut off small corrections.
         size = float(np.abs(wanted).max())
         if size == 0.0:
             return np.zeros(self._sizes[0])

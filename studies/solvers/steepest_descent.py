@@ -10,7 +10,7 @@ from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
 
 #: Iterations on the model in an open-loop solve: with the condition number of such mirrors (10 to 13) the error of the
-#: worst mode falls by 2 % an iteration.
+#: worst mode falls by 2 % per iteration.
 MODEL_ITERATIONS = 200
 
 
@@ -36,7 +36,7 @@ class SteepestDescent(Solver):
         return start + step
 
     def solve(self, wanted: Shape) -> Command:
-        """As in the base class, by iteration on the model."""
+        """Solve as in the base class, but by iteration on the model."""
         self._check(wanted)
         change = self._factors * (wanted - self.offset).coefficients[PISTON_TILT:]
         command = Command(np.zeros(self._matrix.shape[1]))

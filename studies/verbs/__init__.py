@@ -1,1 +1,1 @@
-"""Verbs of `dm` that a checkout has and an installation has not: bench, compare, paper, test."""
+"""Verbs of `dm` that exist in a checkout but not in an installation: bench, compare, paper, test."""

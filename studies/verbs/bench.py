@@ -1,4 +1,4 @@
-"""`dm bench`: speed and memory, beside what one would take instead, in one run."""
+"""`dm bench`: speed and memory, beside the usual alternatives, in one run."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def bench(
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
     effort = Effort(rounds=12, quick=True) if quick else Effort()
     found = others.load(root, rivals and not quick, console.print)
-    with progress_bar(steady=False) as bar:  # a thread that draws would take time from what is measured
+    with progress_bar(steady=False) as bar:  # a thread that draws would take time from the jobs
         task = bar.add_task("bench", total=len(names))
         done = -1
 

@@ -12,7 +12,7 @@ import typer
 
 from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
 
-#: Options by the one that asks for their table, "" = none does; `seed` and `json` go with all.
+#: Options by the option that selects their table, "" = no such option; `seed` and `json` go with all.
 TABLES = {
     "hysteresis": ("plant", "creep", "pixels", "quick"),
     "mirrors": ("maps", "quick"),

@@ -1,4 +1,4 @@
-"""`dm compare --autofocus N`: images, time and error of searches of the sharpest focus, on scenes drawn at random."""
+"""`dm compare --autofocus N`: images, time and error of searches for the sharpest focus, on scenes drawn at random."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 from dm_tools.output import console, progress_bar
 
-#: Scenes without texture for each with: false finds are to be rare.
+#: Scenes without texture for each scene with: false finds should be rare.
 BLANK_SCENES = 20
 
 
 def run(first: int, count: int, workers: int = 2) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures of each method on `count` scenes, and share of false finds on scenes without texture."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # of the processes to come: one core each
+        os.environ.setdefault(name, "1")  # for the processes to come: one core each
     from studies.autofocus.trials import Trial, figures_of, run_scenes
 
     blanks = BLANK_SCENES * count

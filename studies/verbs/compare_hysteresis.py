@@ -52,7 +52,7 @@ def rows_of(ablation: Any) -> list[dict[str, Any]]:
 
 
 def identified_of(ablation: Any) -> list[dict[str, Any]]:
-    """What the calibration of each simulation found."""
+    """Result of the identification on each simulation."""
     return [
         {
             "plant": found.plant,

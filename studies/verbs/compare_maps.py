@@ -1,4 +1,4 @@
-"""The table of `dm compare --maps`: how good open loop is after so many maps, by method."""
+"""The table of `dm compare --maps`: accuracy in open loop against the number of maps, by method."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.verbs.compare_mirrors import WORKERS_MAX
 def run(seeds: Sequence[int], maps: Sequence[int], pixels: int = 236) -> list[dict[str, Any]]:
     """Judge the mirrors of `seeds`; a row for each method and number of maps, lengths in nm."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # of the processes to come: one core each
+        os.environ.setdefault(name, "1")  # for the processes to come: one core each
     from studies.comparison.few_maps import METHODS, judge_all
 
     found = []
@@ -32,7 +32,7 @@ def run(seeds: Sequence[int], maps: Sequence[int], pixels: int = 236) -> list[di
 
 
 def row_of(judged: Sequence[Any], method: str, maps: int) -> dict[str, Any]:
-    """Figures over the mirrors that were calibrated by one method with so many maps, each of which was `judged`."""
+    """Figures over the mirrors that were calibrated by one method with `maps` maps; `judged` holds one per mirror."""
     from studies.comparison.few_maps import GOAL
 
     served = sorted((one for one in judged if len(one.requests.error)), key=lambda one: one.seed)

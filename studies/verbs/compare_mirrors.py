@@ -11,18 +11,18 @@ import numpy as np
 from dm_common.figures import with_wavelengths
 from dm_tools.output import WAVELENGTH, as_wavelengths, console, nanometres, progress_bar
 
-#: Processes at most: a mirror takes a core and some 300 MB.
+#: Largest number of processes: a mirror takes a core and some 300 MB.
 WORKERS_MAX = 2
 #: Columns that the table needs.
 TABLE_WIDTH = 140
-#: Kinds of requests, as JSON names them.
+#: Kinds of requests by their names in JSON.
 GROUPS = ("any_order", "recipes", "restarted", "checked", "power_cut")
 
 
 def run(seeds: Sequence[int], quick: bool) -> list[Any]:
     """Judge the mirrors of `seeds`, printing a line of each when it is done."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # of the processes to come: one core each
+        os.environ.setdefault(name, "1")  # for the processes to come: one core each
     from studies.comparison.population import ANY_ORDER, PopulationOptions, judge_population
 
     options = PopulationOptions(requests=10, maps=150, recipes=0, pixels=120) if quick else PopulationOptions()
@@ -72,7 +72,7 @@ def _number(value: float) -> float | None:
 
 
 def figures_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over all mirrors that stay as they were calibrated; `worst_in_ten` is the 90 % quantile over mirrors."""
+    """Figures over all mirrors that do not change after calibration; `worst_in_ten` = 90 % quantile over mirrors."""
     kept = [row for row in rows if "any_order" in row and not row["changes"]]
     if not kept:
         return {}

@@ -102,7 +102,7 @@ def paper(
         begun = False
 
         def step(what: str) -> None:
-            # A step is told of before it begins, so the bar counts the one before.
+            # A step is announced before it begins, so the bar advances by the one before.
             nonlocal begun
             bar.update(task, advance=1 if begun else 0, description=what)
             begun = True

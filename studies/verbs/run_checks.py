@@ -14,15 +14,15 @@ import typer
 
 from dm_tools.output import JsonOption, console, write_json
 
-#: What `--fast` leaves out: nodes as processes, and what takes half a second and more.
+#: Marker expression of `--fast`: it leaves out tests that start nodes as processes or take half a second and more.
 FAST = "not processes and not slow"
 _CORES = os.cpu_count() or 1
-#: Much of a node's test is waiting, so two at once for each core, but not more nodes than fit into the memory of a
-#: small machine. conftest.py has those first that take longest, and says which modules stay whole.
+#: The tests of nodes mostly wait, so two run at once for each core, but not more nodes than fit into the memory of a
+#: small machine. conftest.py puts the longest ones first, and names the modules that stay whole.
 WORKERS = min(2 * _CORES, 12)
-#: Little of the others is waiting; each worker imports the modules of all tests, which takes some ten seconds.
+#: The other tests hardly wait; each worker imports the modules of all tests, which takes some ten seconds.
 FAST_WORKERS = _CORES + (_CORES + 1) // 2
-#: Takes a minute and more of one core in a fresh checkout: only of what the tests leave.
+#: Takes a minute and more of one core in a fresh checkout, so it gets only the time that the tests leave.
 _TYPES = ["nice", "-n", "19", sys.executable, "-m", "mypy"]
 SCHEDULE = ("--dist", "loadfile", "--no-loadscope-reorder")
 
@@ -69,20 +69,20 @@ def test(
 
 
 def _run(command: list[str], root: Path, environment: dict[str, str], **output: Any) -> tuple[str, dict[str, float]]:
-    """Run a check; what it said, where `output` keeps that, and its figures."""
+    """Run a check; returns its output, where `output` captures it, and its figures."""
     started = time.monotonic()
     done = subprocess.run(command, cwd=root, env=environment, check=False, **output)
     return done.stdout, {"status": done.returncode, "seconds": round(time.monotonic() - started, 1)}
 
 
 def _compile(root: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
-    """Collect all tests beside the lint: in a fresh checkout else every worker compiles them, and what they import."""
+    """Collect all tests beside the lint: in a fresh checkout every worker would else compile them and their imports."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q"]
     return subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def _environment(root: Path) -> dict[str, str]:
-    """This process's; where no bytecode may lie beside the sources it goes elsewhere, for hundreds of nodes start."""
+    """This process's environment; bytecode goes elsewhere if it must not be beside the sources: many nodes start."""
     environment = dict(os.environ)
     if environment.pop("PYTHONDONTWRITEBYTECODE", ""):
         environment["PYTHONPYCACHEPREFIX"] = str(root / "build" / "bytecode")

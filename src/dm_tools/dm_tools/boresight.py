@@ -1,4 +1,4 @@
-"""`dm calibrate --boresight`: the picture of a camera stands still while the focus changes."""
+"""`dm calibrate --boresight`: keep the picture of a camera still while the focus changes."""
 
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,12 @@ from dm_tools.output import NotRunningError, console, next_step, write_json
 from dm_tools.parameter_changes import get_parameter, set_parameter, source_of, write_parameters
 from dm_tools.running_suite import BUSY_S, nodes_of_suite
 
-#: A picture that moves by less over the range stands still [px].
+#: A picture that moves by less than this over the range of curvatures counts as still [px].
 STILL_PX = 0.5
 
 
 def region_of(text: str) -> tuple[float, ...]:
-    """Left, top, width and height. Raises typer.BadParameter."""
+    """Parse `text` as left, top, width and height. Raises typer.BadParameter."""
     from dm_autofocus.sharpness import check_region
 
     try:
@@ -26,7 +26,7 @@ def region_of(text: str) -> tuple[float, ...]:
 
 
 def price(client: Any, axis: Any) -> dict[str, Any]:
-    """What holding the picture costs: reachable curvatures [1/m] and residual [nm rms] with it and with free tilt."""
+    """Cost of holding the picture: reachable curvatures [1/m] and residual [nm rms], with held and with free tilt."""
     from dm_controller.planning.active_calibration import active_calibration
     from dm_controller.planning.target import FocusTarget
 
@@ -50,9 +50,9 @@ def run_boresight(
     config: Path | None,
     json: Path | None,
 ) -> None:
-    """Find the camera's axis, have the focus controller keep the picture there, and see whether it stands still.
+    """Find the camera's axis, set it in the focus controller, and measure whether the picture now stays still.
 
-    Raises DeformableMirrorError when it does not move less than before: the axis is as it was.
+    Raises DeformableMirrorError when the picture moves no less than before; the old axis is then restored.
     """
     from dm_autofocus import CameraFocusClient
     from dm_calibration.influence.poke_cure import parameter_text
@@ -67,7 +67,7 @@ def run_boresight(
         span = reach.curvature_max - reach.curvature_min
 
         def moved() -> tuple[Any, float, float]:
-            """What was found, by how much the picture moves over the range, and its standard deviation, px."""
+            """The result, the motion of the picture over the range and its standard deviation, both in px."""
             with console.status("tip, tilt and focus, to and fro"):
                 found = client.boresight(part, image_topic=image_topic, stamp_lead=lead, take_over=take_over)
             return found, float(span * np.hypot(*found.drift)), float(span * np.hypot(*found.drift_sigma))
@@ -88,7 +88,7 @@ def run_boresight(
                         f"with another axis it moves by {after:.2f} px: does all that is in and near the region stand "
                         "still, at one distance? The axis is as it was",
                     )
-            except BaseException:  # Ctrl-C too: an axis that nobody has seen to be right is not kept
+            except BaseException:  # Ctrl-C too: an axis that was not confirmed is not kept
                 set_parameter(client, "focus_controller", "optical_axis", held.tolist())
                 raise
             console.print(f"now by {after:.2f} px (± {sigma:.2f})")

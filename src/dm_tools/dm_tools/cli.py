@@ -1,4 +1,4 @@
-"""The `dm` command: one module a verb, whose heavy imports wait until the verb runs."""
+"""The `dm` command: one module per verb, whose heavy imports wait until the verb runs."""
 
 import importlib
 import os
@@ -43,20 +43,20 @@ VERBS = {
     "doctor": "dm_tools.doctor.doctor",
     "test": "studies.verbs.run_checks",
 }
-#: Packages that are not installed: their verbs are there where the checkout is.
+#: Packages that are not installed: their verbs exist only in a checkout of the repository.
 CHECKOUT = ("studies", "fault_injection")
 #: Settings of verbs that take more than their own options: `test` hands the rest to pytest.
 SETTINGS = {"test": {"allow_extra_args": True, "ignore_unknown_options": True}}
-#: A number, which may be below zero and no option for that, or have a decimal comma.
+#: A number as users type it: it may be negative, which does not make it an option, or have a decimal comma.
 NUMBER = re.compile(r"[-−]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
-#: Exit codes, as the help says them.
+#: Exit codes, as listed in the help.
 REFUSED, NOT_RUNNING, INTERRUPTED = 1, 3, 130
 EXIT_CODES = f"""Exit codes: 0 done; {REFUSED} refused or failed, with the reason on standard error; 2 wrong usage;
 {NOT_RUNNING} the nodes are not running; {INTERRUPTED} interrupted by Ctrl-C."""
 
 
 class Command(TyperCommand):
-    """A verb that takes `-0.02` and `0,02` for the numbers they are."""
+    """A verb that accepts `-0.02` and `0,02` as numbers."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Write numbers as Python does, and put the first negative argument behind `--`, where nothing is an option.
@@ -84,20 +84,20 @@ class Command(TyperCommand):
 
 
 def _interrupted(error: BaseException) -> str:
-    """That Ctrl-C ended it, and what became of the goal that it cancelled, if any."""
+    """Message after Ctrl-C, with what became of the goal that it cancelled, if any."""
     return "; ".join(filter(None, ("interrupted", str(error))))
 
 
 class Group(TyperGroup):
-    """The command, whose verbs end with the same status when they are interrupted, whatever the version of typer."""
+    """The command group: an interrupted verb ends with the same exit status under every version of typer."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
         try:
-            # `./dm` keeps it back while modules are imported, and typer ends without a word while it reads the words.
+            # `./dm` blocks SIGINT while modules are imported; typer would end silently while it parses the arguments.
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             return super().invoke(ctx)
-        except (KeyboardInterrupt, typer.Abort) as error:  # the latter while something is asked
+        except (KeyboardInterrupt, typer.Abort) as error:  # the latter during a prompt
             fail(_interrupted(error))
             raise typer.Exit(INTERRUPTED) from error
 
@@ -119,21 +119,21 @@ def _options(
 
 
 def _spelt_out(hint: Any) -> Any:
-    """`X | None` as the `Union` that it is: the typer of Ubuntu 24.04 (0.9) knows no other."""
+    """Replace `X | None` by the equivalent `Union`: the typer of Ubuntu 24.04 (0.9) knows no other form."""
     if get_origin(hint) is Annotated:
         return Annotated[(_spelt_out(hint.__origin__), *hint.__metadata__)]
     return Union[get_args(hint)] if isinstance(hint, UnionType) else hint  # noqa: UP007
 
 
 def verb(function: Callable[..., None]) -> Callable[..., None]:
-    """The function of a verb, with types that every typer takes."""
+    """Give the function of a verb type hints that every version of typer understands."""
     hints = get_type_hints(function, include_extras=True)
     function.__annotations__ = {name: _spelt_out(hint) for name, hint in hints.items()}
     return function
 
 
 def make_app() -> typer.Typer:
-    """The command with all verbs that are there."""
+    """Build the command with all verbs that are available."""
     app = typer.Typer(
         name="dm",
         cls=Group,
@@ -160,12 +160,12 @@ app = make_app()
 
 
 def _set_environment() -> None:
-    """What every process of the suite runs with, unless `./dm` or the user has set it."""
+    """Set the environment that every process of the suite runs with, except what `./dm` or the user has set."""
     from ament_index_python.packages import get_package_share_directory
 
     from dm_bringup.nodes import node_environment
 
-    with suppress(LookupError, OSError):  # nothing is sourced: help is all that one gets
+    with suppress(LookupError, OSError):  # no ROS workspace is sourced: only the help works
         for name, value in node_environment(Path(get_package_share_directory("dm_bringup")) / "config").items():
             os.environ.setdefault(name, value)
 
@@ -176,7 +176,7 @@ def run(words: list[str], name: str) -> None:
     try:
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
-        # As dm_msgs/ErrorCode calls it, for who looks it up or searches a log for it.
+        # The name in dm_msgs/ErrorCode, so that users can look it up or search a log for it.
         code = f"{ErrorCode(error.error_code).name}: " if isinstance(error, CodedError) else ""
         fail(f"{code}{error}")
         sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)

@@ -1,6 +1,6 @@
-"""Actions that take long: goals that somebody else sent, and what the feedback says.
+"""Actions that take long: goals that other clients sent, and their feedback in words.
 
-The console shows such goals, can cancel them and does not get in their way; commands name them as what has the mirror.
+The console shows such goals, can cancel them and starts nothing meanwhile; commands name them as holder of the mirror.
 """
 
 import threading
@@ -17,23 +17,23 @@ from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import shape_text
 from dm_common.ros import qos
 
-#: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
+#: Actions that occupy mirror or interferometer for long. `move_focus` is not among them: the next move replaces it.
 LONG = ("build_recipes", "calibrate", "converge")
 #: action_msgs/GoalStatus: accepted, executing, canceling.
 RUNNING = (1, 2, 3)
 
 
 def warning_in(result: Any) -> str:
-    """What the message of a Calibrate result warns of; "" = nothing."""
+    """The warning in the message of a Calibrate result; "" = none."""
     return next((part for part in result.message.split("; ") if part.startswith("warning: ")), "")
 
 
 class ExternalGoals:
-    """Follows all goals of one action by its status and feedback topics. May be asked from any thread.
+    """Follows all goals of one action by its status and feedback topics. May be queried from any thread.
 
     Attributes:
         goals: goals that were seen to begin.
-        feedback: the latest of the goal that runs; None before the first.
+        feedback: the latest of the running goal; None before the first.
         residuals: feedback field `residual_rms` (m) of every step of the last goal.
     """
 
@@ -43,7 +43,7 @@ class ExternalGoals:
         self._running: bytes = b""
         self._own: set[bytes] = set()
         self._ended: set[bytes] = set()
-        self._servers: set[bytes] = set()  # who has it, since the goal began
+        self._servers: set[bytes] = set()  # publishers of the status since the goal began
         self.goals = 0
         self.feedback: Any = None
         self.residuals: list[float] = []
@@ -59,7 +59,7 @@ class ExternalGoals:
         self._own.add(bytes(identity.uuid))
 
     def disown(self, identity: Any) -> None:
-        """Note that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
+        """Note that this console has lost track of the goal `identity`; if it runs, it counts as another client's."""
         self._own.discard(bytes(identity.uuid))
 
     @property
@@ -72,12 +72,12 @@ class ExternalGoals:
         there = {bytes(server.endpoint_gid) for server in known}
         with self._lock:
             self._servers = self._servers or there
-            if not self._servers & there:  # its node has died; one that was started again says nothing of its goals
+            if not self._servers & there:  # its node has died; a restarted node does not report the goal
                 self._running = b""
             return bool(self._running)
 
     def cancel(self) -> Future | None:
-        """Ask the goal that runs to stop: the answer, None = no goal runs. Its status says when it has stopped."""
+        """Ask the running goal to stop; returns the answer, None = no goal runs. Its status shows when it has ended."""
         request = self._interface.Request()
         with self._lock:
             if not self._running:
@@ -114,7 +114,7 @@ class ExternalGoals:
 
 
 def calibration_step(feedback: Any) -> str:
-    """Feedback of the action `calibrate`: phase, what is measured, what was dropped, how good it is so far."""
+    """Feedback of the action `calibrate`: phase, what is measured, what was dropped, and the accuracy so far."""
     text = feedback.phase if feedback.label in ("", feedback.phase) else f"{feedback.phase} {feedback.label}".strip()
     if feedback.maps_dropped:
         text += f", {feedback.maps_dropped} dropped"
@@ -122,7 +122,7 @@ def calibration_step(feedback: Any) -> str:
 
 
 def reached_so_far(feedback: Any) -> str:
-    """How good a calibration that may end early is by its feedback, and what is left; "" = it is not known yet."""
+    """Accuracy so far of a calibration that may end early, by its feedback, and what is left; "" = not known yet."""
     if not feedback.reached_max_zernike > 0.0:
         return ""
     text = f"right to {in_nanometres(feedback.reached_max_zernike)} so far"
@@ -145,7 +145,7 @@ def converge_step(feedback: Any) -> str:
 def recipe_step(feedback: Any, zernike: Sequence[float] = ()) -> str:
     """Feedback of the action `build_recipes`: number in the list, shape, the map and how far off it was.
 
-    `zernike` is that of the goal; () = of somebody else's, which is not known.
+    `zernike` is that of the goal; () = another client's goal, which is not known.
     """
     if not feedback.step:
         return converge_step(feedback)

@@ -1,4 +1,4 @@
-"""What the subcommands share: the console, figures as JSON, progress bars, how they end."""
+"""What the subcommands share: console, figures as JSON, progress bars, and their last lines."""
 
 import json
 import math
@@ -28,25 +28,25 @@ class _Screen(Console):
         return super().render_str(escaped, markup=markup, **how)
 
 
-#: A pipe or a file gets whole lines.
+#: Lines are not wrapped in a pipe or a file.
 console = _Screen(
     highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120, soft_wrap=not sys.stdout.isatty()
 )
 errors = Console(stderr=True, highlight=False, emoji=False)
 
-#: `--json -`.
+#: The value of `--json` for standard output.
 STANDARD_OUTPUT = Path("-")
 #: The wavelength that coefficients are compared with on screens [m].
 WAVELENGTH = 632.8e-9
 
 
 def output_file(path: Path | None) -> Path | None:
-    """`path`, where a file can be written, which a long run must not end with. Raises typer.BadParameter."""
+    """`path`, if a file can be written there: a long run must not fail at its end. Raises typer.BadParameter."""
     if path is None or path == STANDARD_OUTPUT or path.is_relative_to("/dev"):
         return path
     free = False
     with suppress(PermissionError):  # below a folder that cannot be searched
-        nearest = next(folder for folder in path.absolute().parents if folder.exists())  # those below it are made
+        nearest = next(folder for folder in path.absolute().parents if folder.exists())  # missing ones are created
         inside = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
         free = path.is_fifo() or (inside and not path.is_dir())
     if not free:
@@ -55,7 +55,7 @@ def output_file(path: Path | None) -> Path | None:
 
 
 def _free_standard_output(path: Path | None) -> Path | None:
-    """Where figures go to standard output, everything else is written on standard error."""
+    """When the figures go to standard output, write everything else to standard error."""
     path = output_file(STANDARD_OUTPUT if path == Path("/dev/stdout") else path)
     console.file = sys.stderr if path == STANDARD_OUTPUT else None  # type: ignore[assignment]
     return path
@@ -76,8 +76,8 @@ TakeOverOption = Annotated[
 
 
 def checked_namespace(namespace: str) -> str:
-    """`namespace`, where it can be one. Raises typer.BadParameter."""
-    if namespace:  # a command without one does not wait for this
+    """`namespace`, if it is a valid one. Raises typer.BadParameter."""
+    if namespace:  # a command without one does not wait for these imports
         from dm_client import DeformableMirrorError
         from dm_client.connection import full_namespace
 
@@ -105,7 +105,7 @@ def fail(message: str) -> None:
 
 
 def in_namespace(text: str, namespace: str) -> str:
-    """`text` with the namespace given to each command in it that asks running nodes."""
+    """Add the namespace to each command in `text` that talks to running nodes."""
     if not namespace:
         return text
     text = text.replace("lifecycle set /", f"lifecycle set /{namespace}/")
@@ -113,14 +113,14 @@ def in_namespace(text: str, namespace: str) -> str:
 
 
 def next_step(text: str, namespace: str = "") -> None:
-    """The last line of a command: what one does after it."""
+    """Print the last line of a command: what to do next."""
     console.print(f"[dim]next: {in_namespace(text, namespace)}[/]", soft_wrap=True)
 
 
 def progress_bar(steady: bool = True) -> Progress:
     """A progress bar with step i of n and the time left; not `steady` = drawn only when `refresh()` is called.
 
-    Nothing is drawn where nobody watches: into a pipe or a file.
+    Nothing is drawn into a pipe or a file.
     """
     return Progress(
         TextColumn("{task.description}", markup=False),
@@ -156,7 +156,7 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    # Nothing may stand in for a device or a pipe.
+    # A device or a pipe must not be replaced by a file.
     if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
         path.write_text(text)
     else:
@@ -170,11 +170,11 @@ def nanometres(length: float) -> float:
 
 
 def figures(message: Any, *names: str) -> dict[str, Any]:
-    """Fields of `message` for JSON; of a name that ends in `_nm` the field without that, in nanometres."""
+    """Fields of `message` for JSON; a name that ends in `_nm` means the field without this suffix, in nanometres."""
     fields = {name: getattr(message, name.removesuffix("_nm")) for name in names}
     return {name: nanometres(value) if name.endswith("_nm") else value for name, value in fields.items()}
 
 
 def as_wavelengths(length: float) -> str:
-    """A length (m) by the wavelength of the interferometer, such as λ/50; "" above λ/5."""
+    """A length (m) as a fraction of the interferometer's wavelength, such as λ/50; "" above λ/5."""
     return in_wavelengths(length, WAVELENGTH)

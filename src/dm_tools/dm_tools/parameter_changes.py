@@ -1,4 +1,4 @@
-"""Changes to parameters that a measurement has found: of running nodes, and in their parameter file."""
+"""Apply parameters that a measurement has found: to running nodes, and to their parameter file."""
 
 from collections.abc import Container
 from itertools import chain, count
@@ -71,15 +71,15 @@ def write_parameters(
 ) -> None:
     """Write the parameter file `target`: `source` with the `parameters` found of a mirror; comments are kept.
 
-    What stood at `target` is kept beside it, and nothing that was kept so before is lost.
+    An existing file at `target` is kept beside it, and earlier copies are never overwritten.
 
     Args:
-        nodes: that run. With autofocus the virtual bench that ships was started with a camera, which is not in its
-            file: it is written too.
+        nodes: names of the running nodes. With autofocus, the shipped virtual bench was started with a camera, which
+            is not in its file: it is written too.
 
     Raises:
         ConfigError: `source` cannot be changed without losing its form.
-        OSError: it cannot be read any more, or not be written; what stood at `target` still does.
+        OSError: `source` cannot be read, or `target` cannot be written; an existing `target` is then unchanged.
     """
     from dm_bringup.config_edit import edited, values_of
     from dm_common.atomic_write import write_whole
@@ -96,7 +96,7 @@ def write_parameters(
 
 
 def keep_before(target: Path) -> None:
-    """Keep what stands at `target`, if anything does, beside it under a free name. Raises OSError."""
+    """Copy an existing file at `target` beside it under a free name. Raises OSError."""
     from dm_common.atomic_write import write_whole
 
     if target.exists():

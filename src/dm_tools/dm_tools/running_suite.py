@@ -1,4 +1,4 @@
-"""The running suite, as the verbs meet it: whether it is there, who holds the mirror, where the mirror stands."""
+"""State of the running suite for the verbs: which nodes run, who holds the mirror, and the present shape."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from dm_tools.output import NotRunningError, as_wavelengths, errors
 if TYPE_CHECKING:
     from dm_client import DeformableMirrorClient
 
-#: Time in which nodes on this machine are found, s; on a busy one it takes longer.
+#: Time in which nodes on this machine are found, s: usually, and on a busy machine.
 FIND_S = 1.2
 BUSY_S = 5.0
-#: Time in which every node reports its health, and an action what it is doing, s.
+#: Time in which every node reports its health, and an action its progress, s.
 REPORT_S = 1.5
 
-#: Nodes without which there is no bench, and what follows where one is missing.
+#: Nodes without which there is no bench, and the effect when one is missing.
 NEEDED = {
     "pdm_driver": "nothing can move, and what stands at the electronics is not known",
     "interferometer": "no maps can be measured",
@@ -59,14 +59,14 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
 
 
 def promise(bound: float) -> str:
-    """A 95 % bound on the largest coefficient error (m) in the one way all verbs put it."""
+    """A 95 % bound on the largest coefficient error (m) as text, the same in all verbs."""
     if not bound > 0.0:
         return "not known"
     return f"{in_nanometres(bound)} ({', '.join(filter(None, ('95 % bound', as_wavelengths(bound))))})"
 
 
 def promise_of(calibration: Any) -> float:
-    """m, 95 % bound on the largest coefficient error of a request but for creep, as a calibration's message tells."""
+    """95 % bound on the largest coefficient error of a request without creep, m, from a calibration's message."""
     from dm_common.hysteresis.model import IN_USE
     from dm_common.messages import hysteresis_model_from
 
@@ -76,7 +76,7 @@ def promise_of(calibration: Any) -> float:
 
 
 def unknown_history(capabilities: Any) -> str:
-    """Why the focus controller does not know what the actuators went through; "" = it does, or is not heard."""
+    """Why the focus controller does not know the history of the actuators; "" = it does, or is not heard."""
     said = capabilities.message.split("; ") if capabilities is not None else []
     return next((text.removeprefix(HISTORY_UNKNOWN) for text in said if text.startswith(HISTORY_UNKNOWN)), "")
 
@@ -108,7 +108,7 @@ def verdict(promised: float, measured: float) -> str:
 
 
 def holder(client: DeformableMirrorClient) -> str:
-    """Who has the mirror for itself and since when, as the driver says it, and how far they are; "" = nobody."""
+    """Who holds the mirror and since when, as reported by the driver, and the progress made; "" = nobody."""
     from dm_client.client import INTERFACES
     from dm_tools.long_actions import LONG, ExternalGoals
 
@@ -116,7 +116,7 @@ def holder(client: DeformableMirrorClient) -> str:
     state = client.messages.get("actuator_state")
     if state is None or not state.holder:
         return ""
-    holding = state.holding.partition(": ")[0]  # how to end it is said in the words of the command
+    holding = state.holding.partition(": ")[0]  # without the driver's hint how to end it: the commands give their own
     goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in LONG]
     client.wait(lambda: any(goal.running for goal in goals), 0.5)
     running = next((goal for goal in goals if goal.running), None)
@@ -129,9 +129,9 @@ def holder(client: DeformableMirrorClient) -> str:
 
 @contextmanager
 def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
-    """Say of a request that is refused within who has the mirror for itself, and how to end that.
+    """Add to the error of a request that is refused within who holds the mirror, and how to end that.
 
-    While the first calibration runs, that there is none says nothing either.
+    The same holds for NOT_CALIBRATED: while the first calibration runs, that alone does not explain the refusal.
     """
     from dm_client import DeformableMirrorError
 
@@ -141,7 +141,7 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
         if error.error_code in (ErrorCode.BUSY, ErrorCode.NOT_CALIBRATED) and (by := holder(client)):
             none = "no calibration is in use yet; " if error.error_code == ErrorCode.NOT_CALIBRATED else ""
             text = f"{none}{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
-            # The same action takes one goal at a time, and without a calibration nothing else is possible yet.
+            # Taking over is no help against a goal of the same action, nor before there is a calibration.
             if error.response is not None and error.error_code == ErrorCode.BUSY:
                 text += ", or end it with --take-over"
             raise DeformableMirrorError(error.error_code, text, error.response) from error
@@ -149,7 +149,7 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
 
 
 def hear_health(client: DeformableMirrorClient, times: list[int] | None = None) -> dict[str, Any]:
-    """{node: its latest status on /diagnostics}, filled from now on, as are `times` of the bench, s."""
+    """{node: its latest status on /diagnostics}, filled from now on, as is `times` with times of the bench, s."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     heard: dict[str, Any] = {}
@@ -167,14 +167,14 @@ def hear_health(client: DeformableMirrorClient, times: list[int] | None = None) 
 
 
 class SettledShape(NamedTuple):
-    """The shape that stands, as the controller reports it.
+    """The present shape, as the controller reports it.
 
     Attributes:
         curvature: 1/m.
         seconds: since its command.
         bound: m, 95 % bound on its largest coefficient error.
         held: creep is fed forward.
-        predicted: m, of that error, what is predicted beforehand: the limits leave it, and maps agree with it.
+        predicted: m, the part of that error that was predicted: it is due to the limits, and maps should show it.
     """
 
     curvature: float
@@ -185,7 +185,7 @@ class SettledShape(NamedTuple):
 
 
 def settled_shape(health: dict[str, Any]) -> SettledShape | None:
-    """The shape that stands; None = not one that was asked for as a curvature."""
+    """The present shape; None = it was not requested as a curvature."""
     controller = health.get("focus_controller")
     values = {pair.key: pair.value for pair in controller.values} if controller is not None else {}
     if "curvature" not in values:

@@ -28,7 +28,7 @@ class SurfaceError:
 
 
 def map_of(image: Any) -> NDArray[np.float32]:
-    """The sag (H, W) [m] of a sensor_msgs/Image. Raises ValueError when it is another image, or contradicts itself."""
+    """The sag (H, W) [m] of a sensor_msgs/Image. Raises ValueError when it is no surface map or is inconsistent."""
     if image.encoding != "32FC1":
         raise ValueError(f"encoding = {image.encoding!r}: a surface map is 32FC1")
     return pixels_of(image)[..., 0]

@@ -1,1 +1,1 @@
-"""Benchmarks of computation: each times one task beside what a user would take instead."""
+"""Benchmarks of computation: each times one task beside the usual alternative."""

@@ -22,16 +22,16 @@ from studies.solvers.plate_model import PlateProperties, plate_influence
 
 PITCH = 4.3e-3  # m between actuators of a PDM30-37
 STROKE = 4e-6  # m per unit signal
-#: Ridge as a share of an actuator's typical response, as the focus controller takes it.
+#: Ridge as a share of an actuator's typical response, as in the focus controller.
 RIDGE_SHARE = 0.01
-#: Defocus in m, least and most, from where one actuator stands at its limit to where most do.
+#: Smallest and largest defocus, m: from one actuator at its limit to most of them.
 SATURATING = (2e-6, 4.5e-6)
 SATURATED_TARGETS = 24
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A mirror's programme, with the triangle it solves on for others to solve the same."""
+    """A mirror's bounded programme, and the matrix and ridge that it is made of, for other solvers."""
 
     programme: BoundedProgramme
     matrix: Floats
@@ -57,7 +57,7 @@ def problem(actuators: int) -> Problem:
 
 
 def targets(task: Problem, depth: tuple[float, float], count: int, generator: np.random.Generator) -> list[Floats]:
-    """Right-hand sides: defocus of `depth` (m, least and most) of either sign with some of all other terms."""
+    """Right-hand sides: defocus of either sign of `depth` (m, least and most), and a little of all other terms."""
     result = []
     for share in np.linspace(0.0, 1.0, count):
         coefficients = generator.normal(size=len(TERMS)) * 0.05e-6
@@ -78,7 +78,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     projection = orthogonal[: len(task.matrix)].T
 
     def bvls(wanted: Floats) -> Floats:
-        """On the triangle, which favours it: as few numbers as the programme itself works on."""
+        """Solve on the triangular factor, in favour of BVLS: it is as small as what the programme works on."""
         result: Floats = lsq_linear(triangle, projection @ wanted, (-1.0, 1.0), "bvls", max_iter=2000).x
         return result
 

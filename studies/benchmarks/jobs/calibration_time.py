@@ -1,4 +1,4 @@
-"""What calibrating computes, beside the time a real bench needs for its moves and maps."""
+"""CPU time of the fits of a calibration, beside the time that a real bench needs for its moves and maps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from studies.comparison.simulated_bench import Floats, SimulatedBench, Simulatio
 
 
 class TimedBench(SimulatedBench):
-    """A simulation whose own work, which a real bench has no part in, is timed apart from that of calibrating.
+    """A simulation that times its own work apart from the calibration's: a real bench has no such work.
 
     Attributes:
         own_s: CPU time spent on simulating, s.
@@ -47,8 +47,8 @@ class TimedBench(SimulatedBench):
 def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     """Figure `calibration`: per plan CPU time of all fits (s), time on a bench (s), and their ratio.
 
-    Bench time is that of ramps, settling and exposure with half a second each for the last two. Reading the files is
-    not in it: see `file_to_coefficients`. A quick run takes small maps and only the plan FULL.
+    Bench time is that of ramps, settling and exposure, half a second for each of the last two. Reading the files is not
+    included: see `file_to_coefficients`. A quick run takes small maps and only the plan FULL.
     """
     config = SimulationConfig(law="preisach", seed=5, pixels=236 if effort.quick else 944)
     plans = {"full": (PlanKind.FULL, None), "hysteresis": (PlanKind.HYSTERESIS, PlanOptions())}

@@ -1,4 +1,4 @@
-"""The inverse of identified hysteresis models, beside the linear solve with clipping, and its growth with actuators."""
+"""The inverse of identified hysteresis models, beside the linear solve with clipping; its growth with actuators."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from studies.benchmarks import stand_in_mirror
 from studies.benchmarks.jobs.scaling import ACTUATORS
 from studies.benchmarks.timing import Effort, medians
 
-#: Moves that the mirror has behind it, and s after its last at which it is asked.
+#: Number of earlier moves, and time after the last of them at which the inverse is computed, s.
 MOVES, ASKED_S = 12, 10.0
 REACH = 0.03  # 1/m
-#: Signals stay within the limits here, so that no branch is left out or taken in all.
+#: Amplitudes of earlier moves and of aims: inside the limits, so that no branch of code is left out or always taken.
 SWING, AIM = 0.7, 0.6
 
 

@@ -1,4 +1,4 @@
-"""The influence function from the maps of a run: time beyond taking them in, and memory."""
+"""The influence function from the maps of a run: time without reading the maps, and memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from studies.benchmarks.sample_maps import CAMERA, maps
 from studies.benchmarks.timing import Effort, medians
 
 ACTUATORS = 37
-#: Maps of the run; on so many of them the loop of dmlib is timed, whose time is proportional to their number.
+#: Maps of the run; dmlib's loop is timed on LOOP_MAPS of them, as its time is proportional to their number.
 RUN, LOOP_MAPS = 75, 5
 #: Noise of a coefficient and of a sample, m.
 NOISE = 1e-9
@@ -95,7 +95,7 @@ def _run(count: int, generator: np.random.Generator) -> tuple[MapSet, Floats]:
 def _dmlib_loop(design: Floats, phases: Floats) -> Floats:
     """Sums of the normal equations map by map, after `calibrate` of dmlib's calibration.py (J. Antonello, GPL-3).
 
-    Only the method: (V, N) gets the outer product of every map and its commands, one at a time.
+    The method only: the outer product of every map and its commands is added to (V, N), one map at a time.
     """
     commands = np.zeros((design.shape[1], design.shape[1]))
     products = np.zeros((phases.shape[1], design.shape[1]))
@@ -122,14 +122,14 @@ def peak_memory(count: int, pixels: int = CAMERA) -> float:
 
 
 def main() -> None:
-    """Take in a file again and again as the maps of a run, and print this process's peak memory in MB."""
+    """Read a file repeatedly as the maps of a run, and print this process's peak memory in MB."""
     count, path = int(sys.argv[1]), Path(sys.argv[2])
     ingest, settings = Ingest(), IngestSettings()
     for _ in range(count):
         ingest.read(path, settings)
-    # The fit of the longest run whatever the number of maps read, or memory could not be compared.
+    # The fit is always that of the longest run, so that memory depends on the number of maps read alone.
     fit_influence(_run(RUN, np.random.default_rng(count))[0])
-    # Not `ru_maxrss`: that begins with the memory of the process that started this one.
+    # Not `ru_maxrss`: it starts at the memory of the process that started this one.
     status = Path("/proc/self/status").read_text()
     peak = next(line for line in status.splitlines() if line.startswith("VmHWM"))
     print(float(peak.split()[1]) * 1024 / 1e6)

@@ -20,7 +20,7 @@ from studies.paper.regions import ConcentricRegions, residual_map, squared_dista
 
 Fit = Callable[[Floats], Floats]
 
-#: Maps in turn: together larger than the last-level cache of most processors.
+#: Number of maps used in turn: together larger than the last-level cache of most processors.
 MAPS = 16
 
 
@@ -42,7 +42,7 @@ def measure(effort: Effort, rivals: dict[str, ModuleType]) -> dict[str, Any]:
     jobs |= {name: partial(_fit_next, fit, other) for name, fit in fits.items() if name != "fit"}
     slow = {name: effort.slow_rounds for name in fits if name != "fit"}
     seconds = medians(jobs, effort.rounds, slow)
-    # On its own, or the maps of the others would push this one out of the cache.
+    # Timed on its own: the maps of the others would push this one out of the cache.
     in_cache = medians({"fit": lambda: fits["fit"](some[0])}, effort.rounds)["fit"]
     in_cache_read = medians({"read": lambda: _read(some[0])}, effort.rounds)["read"]
     exact = fits["lstsq"](some[0])
@@ -70,7 +70,7 @@ def _fit_next(fit: Fit, ring: Ring) -> Floats:
 
 
 def _read(sag: Floats) -> float:
-    """Read every byte once, as fast as the library for linear algebra can."""
+    """Read every byte once, at the full speed of the linear algebra library."""
     return float(np.vdot(sag, sag))
 
 
@@ -106,7 +106,7 @@ def _regions(effort: Effort, fitter: MapFitter, some: list[Floats]) -> dict[str,
     return {"ms": 1e3 * seconds["one"], "ten_passes_ms": 1e3 * seconds["ten"]}
 
 
-# --- the same with other programs; what depends on the mask alone is prepared beforehand, as far as they let one
+# --- the same with other programs; what depends on the mask alone is prepared beforehand, as far as they allow it
 
 
 def _unit_grid() -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Reading a map file, beside no more than bringing its bytes into memory in the processor's order."""
+"""Reading a map file, beside the minimum: bringing its bytes into memory in the processor's order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def write_sample(path: Path, pixels: int = CAMERA) -> None:
 
 
 def measure(effort: Effort, rivals: dict[str, ModuleType]) -> dict[str, Any]:
-    """Figure `read_dat`; times in ms. `with_sha256_ms` includes the digest that a calibration's record asks for."""
+    """Figure `read_dat`; times in ms. `with_sha256_ms` includes the digest that is stored with a calibration."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.dat"
         write_sample(path)

@@ -15,7 +15,7 @@ from studies.benchmarks.jobs.bounded_solve import problem, targets
 from studies.benchmarks.sample_maps import full_aperture, mask_of, surface
 from studies.benchmarks.timing import Effort, medians
 
-#: Full hexagons; 3 997 is the one next to 4 000.
+#: Full hexagons; 3 997 is the one closest to 4 000.
 ACTUATORS = (37, 127, 469, 1027, 3997)
 #: Largest mirror for which saturated commands and the regression are measured: beyond it they take minutes.
 FITTED_ACTUATORS = 1027

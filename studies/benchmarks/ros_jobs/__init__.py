@@ -1,1 +1,1 @@
-"""Benchmarks of running nodes: latencies between processes and hosts, and what idle nodes cost."""
+"""Benchmarks of running nodes: latencies between processes and hosts, and the cost of idle nodes."""

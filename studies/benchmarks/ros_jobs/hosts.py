@@ -1,6 +1,6 @@
-"""Driver and controller on two machines: two network namespaces with a cable (veth) between them, on this one.
+"""Driver and controller on two machines: two network namespaces on this one, with a cable (veth) between them.
 
-Where they cannot be made (see :mod:`studies.network_namespaces`) the job says why it was left out.
+If these cannot be made (see :mod:`studies.network_namespaces`), the job reports why it was left out.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Client of the benchmark `hosts`: asks a focus controller and times command and report. Run as a process.
+"""Client of the benchmark `hosts`: sends requests to a focus controller and times its commands and the reports.
 
     python -m studies.benchmarks.ros_jobs.hosts_client ROUNDS NAMESPACE
 
-Prints a line of JSON: medians and 99th percentiles in us, from the request to the command that the controller
-publishes, and from there to the driver's report that it has written it.
+Run as a process. Prints a line of JSON: medians and 99th percentiles in us, from the request to the command that the
+controller publishes, and from there to the driver's report that the command was written.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FIRST_S, ANSWER_S, PAUSE_S = 60.0, 2.0, 0.03
 
 
 class Client(Node):
-    """Records what the two nodes say."""
+    """Records the messages of the two nodes, with their times of arrival."""
 
     def __init__(self, namespace: str) -> None:
         super().__init__("client", namespace=namespace)
@@ -54,7 +54,7 @@ class Client(Node):
 
 
 def main() -> int:
-    """Exit status 0 with figures, 1 when somebody did not answer."""
+    """Exit status 0 with figures, 1 when a node did not answer."""
     rounds, namespace = int(sys.argv[1]), sys.argv[2]
     rclpy.init()
     client = Client(namespace)

@@ -1,4 +1,4 @@
-"""What the nodes cost while nobody asks for anything."""
+"""CPU time of the nodes while there are no requests."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
 from studies.benchmarks.timing import Effort
 
-#: Time for starts to be over, and time measured, s.
+#: Time until the starts are over, and time measured, s.
 START_S, MEASURED_S = 6.0, 20.0
 
 
 def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
-    """Figure `idle`: per cent of one core, of the nodes that run on a real bench together, and each.
+    """Figure `idle`: per cent of one core, of each node, and in sum of those that run on a real bench.
 
-    The mirror stands in its safe shape and no file arrives; the simulation's process is not part of the sum.
+    The mirror is in its safe shape and no file arrives; the simulation's process is not part of the sum.
 
     Raises:
         RuntimeError: a node has ended.

@@ -1,7 +1,7 @@
-"""Map file on disk to coefficients published by the interferometer node, beside its parts.
+"""Time from a map file on disk to coefficients published by the interferometer node, beside its parts.
 
-By service `ingest_file`, which names a file that is complete; and from the watched folder, where a file is taken when
-its writer has closed it.
+By service `ingest_file`, which names a complete file, and from the watched folder, where a file is taken once its
+writer has closed it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from studies.benchmarks.timing import Effort, medians
 
 PITCH, WAVELENGTH = 25e-6, 632.8e-9
 RADIUS = PITCH * CAMERA / 2
-#: Maps with dropouts of their own, used in turn.
+#: Number of maps used in turn, each with dropouts of its own.
 MAPS = 6
 PAUSE_S = 0.05
 ARRIVAL_S, REST_S = 20.0, 2.0
@@ -42,7 +42,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     """Figure `file_to_coefficients`, in ms; `.datx` under `datx`, the folder under `watched`, the parts under `parts`.
 
     Raises:
-        RuntimeError: the node ended, or a map did not come out.
+        RuntimeError: the node ended, or published no coefficients.
     """
     generator = np.random.default_rng(20)
     sags = [maps(CAMERA, 1, generator)[0][0] for _ in range(2 if effort.quick else MAPS)]
@@ -54,7 +54,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     with laboratory() as room:
         node = _Interferometer(room)
         named = {suffix: [node.named(some[0], suffix) for _ in range(2)] for suffix, some in contents.items()}
-        # One after the other: behind a .datx the helper process for the next one starts, beside whatever comes then.
+        # One kind after the other: after a .datx, the helper process for the next one starts, beside whatever follows.
         for suffix, some in contents.items():
             for number in range(rounds if suffix == "dat" else rounds // 5):
                 named[suffix].append(node.named(some[number % len(some)], suffix))
@@ -96,7 +96,7 @@ class _Interferometer:
         return self._await(path, asked, answer.done)
 
     def rest(self) -> None:
-        """Wait until nothing of what was done goes on."""
+        """Wait until all background work is over."""
         self._room.serve(REST_S)
 
     def watched(self, content: bytes) -> float:

@@ -1,4 +1,4 @@
-"""A bare relay of the focus controller's messages: the floor of what rclpy can do. Run as a process.
+"""A bare relay of the focus controller's messages: the lower limit of what rclpy can do. Run as a process.
 
 python -m studies.benchmarks.ros_jobs.relay_node events|single|multi --ros-args -r __ns:=/relay
 """

@@ -1,8 +1,8 @@
 """Curvature request to actuator command, between processes: the focus controller beside a bare relay.
 
-Every request waits for its answer before the next one, in turns, so that a busy moment of the machine meets relay and
-controller alike; figures are medians over blocks of such turns. The controller runs as on a bench: a calibration whose
-hysteresis is identified, and a driver that reports every move.
+Every request waits for its answer before the next one. The nodes take turns, so that a busy moment of the machine
+affects relay and controller alike; figures are medians over blocks of such turns. The controller runs as on a bench: a
+calibration with identified hysteresis, and a driver that reports every move.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from studies.benchmarks.timing import Effort
 
 #: Class of the hysteresis model in the calibration.
 LAW = "Preisach"
-#: Largest curvature asked for, 1/m: reachable, some actuators at their limits.
+#: Largest curvature requested, 1/m: reachable, some actuators at their limits.
 REACH = 0.03
-#: Between two requests, s: what the node has to do after a command is over; and so long that each of two peers gets
+#: Pause between two requests, s: for the work that the node does after a command; and such that each of two peers gets
 #: some 100 requests a second.
 PAUSE_S, CAMERA_PAUSE_S = 1e-3, 4e-3
-#: Requests for each in one block; figures are medians over blocks.
+#: Number of requests for each peer in one block; figures are medians over blocks.
 BLOCK = 150
 WARM_UP = 50
-#: The stream that must not grow queues.
+#: Rate of a stream that must not make queues grow, 1/s.
 STREAM_RATE = 500.0
 ANSWER_S = 2.0
-#: As the driver reports when nothing happens: one that is silent is taken for dead.
+#: Period of the driver's reports when nothing happens, s: a silent driver is taken for dead.
 REPORT_PERIOD_S = 0.5
 EXECUTORS = ("events", "single", "multi")
 
 
 @dataclass
 class Peer:
-    """One node under test: its publishers, and the times its answers came.
+    """One node under test: its publishers, and the arrival times of its answers.
 
     Attributes:
-        answers: commands in order, each with the time it came, ns.
+        answers: commands in order, each with its time of arrival, ns.
     """
 
     room: Laboratory
@@ -65,20 +65,20 @@ class Peer:
         self.after(command)
 
     def asked_by(self) -> list[tuple[int, float]]:
-        """Times of the answers (ns) with the curvatures they answer."""
+        """Times of the answers (ns) with the curvatures of their requests."""
         return [(when, command.signals[0]) for when, command in self.answers]
 
     def after(self, command: ActuatorCommand) -> None:
-        """What the neighbours do with a command."""
+        """Simulate the neighbours' reaction to a command."""
 
     def connected(self) -> bool:
-        """Whether the node is there."""
+        """Whether the node is connected in both directions."""
         return bool(
             self.publisher.get_subscription_count() and self.room.node.count_publishers(self.subscription.topic)
         )
 
     def request(self, curvature: float) -> int:
-        """Send a request; returns when, ns."""
+        """Send a request; returns the time, ns."""
         message = FocusRequest(curvature=curvature)
         message.header.stamp = self.room.node.get_clock().now().to_msg()
         sent = time.perf_counter_ns()
@@ -86,7 +86,7 @@ class Peer:
         return sent
 
     def round_trip(self, curvature: float) -> float:
-        """Time to the command, s; NaN when none came."""
+        """Time until the command, s; NaN when there was none."""
         self.answers.clear()
         sent = self.request(curvature)
         self.room.serve(ANSWER_S, lambda: bool(self.answers))
@@ -94,7 +94,7 @@ class Peer:
 
 
 class FocusPeer(Peer):
-    """The focus controller between stand-ins of its neighbours: calibration, and a driver that moves at once."""
+    """The focus controller among stand-ins of its neighbours: a calibration, and a driver that moves at once."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -135,10 +135,10 @@ class FocusPeer(Peer):
         self._state.publish(report)
 
     def calibrate(self) -> None:
-        """Have the controller take the calibration, and tell of a degauss, so that it knows the history."""
+        """Have the controller take the calibration, and report a degauss, so that it knows the history."""
         self._info.publish(stand_in_mirror.mirror_info())
         self._calibration.publish(stand_in_mirror.calibration(LAW))
-        self._report(doubles(np.zeros(37)))  # without a driver that reports nothing is reachable
+        self._report(doubles(np.zeros(37)))  # nothing is reachable without a driver that reports
         self.room.wait_for(
             "the controller's calibration",
             lambda: self._capabilities and self._capabilities[-1].quality == Capabilities.CALIBRATED,
@@ -172,7 +172,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     with laboratory() as room:
         peers = [_started(room, kind) for kind in EXECUTORS]
         _collected(peers, WARM_UP, generator)
-        # The multi-threaded one of Jazzy slows down what runs beside it, so it comes only here.
+        # The multi-threaded executor of Jazzy slows down whatever runs beside it, so it comes only here.
         executors = [_collected(peers, BLOCK, generator, CAMERA_PAUSE_S) for _ in range(1 if effort.quick else 4)]
     return {
         "relay": _percentiles(turns, 0),
@@ -217,14 +217,14 @@ def _collected(peers: list[Peer], rounds: int, generator: np.random.Generator, p
 
 
 def _percentiles(turns: list[Floats], peer: int) -> dict[str, float]:
-    """Of one peer in blocks (peers, n): medians over the blocks."""
+    """Figures of one peer, from blocks (peers, n): medians over the blocks."""
     microseconds = np.array(turns)[:, peer]
     p50, p99 = np.median(np.nanpercentile(microseconds, (50, 99), axis=1), axis=1)
     return {"p50_us": float(p50), "p99_us": float(p99), "lost": int(np.count_nonzero(np.isnan(microseconds)))}
 
 
 def _ratios(turns: list[Floats]) -> dict[str, float]:
-    """Of blocks (2, n), relay and controller: medians over the blocks, and the least, of the ratio within each."""
+    """Ratios of controller to relay within each of the blocks (2, n): median and smallest over the blocks."""
     levels = np.nanpercentile(np.array(turns), (50, 99), axis=2)  # (2, B, 2)
     ratio = levels[:, :, 1] / levels[:, :, 0]
     return {
@@ -236,7 +236,7 @@ def _ratios(turns: list[Floats]) -> dict[str, float]:
 
 
 def _stream(room: Laboratory, peer: Peer, seconds: float, generator: np.random.Generator) -> dict[str, float]:
-    """Requests at STREAM_RATE whatever becomes of them: how many are answered, and whether answers grow older."""
+    """Send requests at STREAM_RATE without waiting: how many are answered, and whether answers become later."""
     peer.answers.clear()
     sent: dict[float, int] = {}
     began = time.monotonic()

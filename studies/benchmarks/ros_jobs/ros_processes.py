@@ -1,4 +1,4 @@
-"""Processes of one job of the benchmark, on a ROS domain of their own, and the client that they answer."""
+"""Processes of one job of the benchmark, on a ROS domain of their own, and their client."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Laboratory:
         return process
 
     def serve(self, seconds: float, until: Callable[[], Any] = lambda: False) -> bool:
-        """Serve the client for so long, or until something is true; returns whether it was."""
+        """Serve the client for `seconds`, or until a condition is true; returns whether it is."""
         end = time.monotonic() + seconds
         while not until():
             remaining = end - time.monotonic()
@@ -72,7 +72,7 @@ class Laboratory:
         """Serve the client until `condition()`.
 
         Raises:
-            RuntimeError: not in time, or a process has ended, with its last words.
+            RuntimeError: not in time, or a process has ended; with the end of its log.
         """
         end = time.monotonic() + seconds
         while not self.serve(0.1, condition):
@@ -96,7 +96,7 @@ def laboratory() -> Iterator[Laboratory]:
     """A laboratory on a ROS domain and in a folder of its own."""
     with own_domain() as domain, tempfile.TemporaryDirectory(prefix="dm-bench-") as folder:
         room = Laboratory(domain, Path(folder))
-        # A full collection through all that other jobs have imported would stall the client.
+        # A full garbage collection through everything that other jobs have imported would stall the client.
         gc.collect()
         gc.freeze()
         try:

@@ -74,7 +74,7 @@ def table_1(results: Results) -> Section:
 
 
 def _linearity_table(results: Results) -> Table:
-    """What section 2.1 takes p01–p05 and p46–p54 for."""
+    """The degree of linearity, for which section 2.1 uses p01–p05 and p46–p54."""
     header, rows = ["surfaces"], []
     for name in results.benches:
         header += [f"{name}: nm rms per unit signal", "departure", "R²"]
@@ -171,7 +171,7 @@ def _rising(results: Results) -> str:
 
 
 def _readings(results: Results) -> str:
-    """Which ways to read Fig. 5(a) rise in every step."""
+    """The readings of Fig. 5(a) whose mean rises in every step."""
     readings = results.standard.samples.readings
     rising = [name for name, panel in readings.items() if (np.diff(panel.mean) > 0).all()]
     others = [f"{name} ({_falls(panel)} of 9 steps fall)" for name, panel in readings.items() if name not in rising]

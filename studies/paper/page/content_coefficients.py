@@ -19,12 +19,12 @@ from studies.paper.page.control_figures import coefficients_figure, sweep_figure
 from studies.paper.results import IDEAL, LAW_METHOD, STANDARD, BenchResults, Results
 
 NM = 1e9
-#: The reading that Figs. 6 and 7 show: open loop, started from a surface measured there and then.
+#: The reading shown in Figs. 6 and 7: open loop, from a start that was measured just before the move.
 SHOWN = "measured"
-#: Number of the paper's figures by method: measured surfaces, coefficient errors.
+#: Numbers of the paper's figures by method: measured surfaces, coefficient errors.
 FIGURES = {"AZWreg": (6, 8), "AZreg": (7, 9)}
 WITH = {"AZWreg": "with region weights", "AZreg": "without region weights"}
-#: Parts of the wavelength that the spheres are counted by, the paper's two among them.
+#: Parts of the wavelength within which spheres are counted; two of them are the paper's.
 MARKS = (50, 100, 200, 500, 1000)
 #: Method of the table by radial order.
 BY_ORDER = "AZreg"
@@ -111,7 +111,7 @@ def _verdict(name: str, bench: BenchResults) -> str:
 
 
 def _hysteresis_bound(results: Results) -> str:
-    """Why a linear model stops where it does, by two measurements."""
+    """Two measurements that show what limits a linear model."""
     standard, ideal = results.standard, results.ideal
     radius = standard.samples.bench.mirror.working_radius
     missed = []
@@ -153,7 +153,7 @@ def _loops(bench: BenchResults) -> str:
 
 
 def _foreign(results: Results) -> str:
-    """What the identified model is worth on mirrors that follow another law."""
+    """Accuracy with the identified model on mirrors that follow another law."""
 
     def median(law: str, reading: str) -> str:
         length = float(np.median(results.law_spheres[law][reading].true_max_zernike))

@@ -11,7 +11,7 @@ from studies.paper.results import Results
 from studies.paper.sampling_study import SamplingResult
 
 NM = 1e9
-#: Names of the ways of sampling in `optics.sampling_study`: the paper's, the one with area weights, every pixel.
+#: Names of the ways of sampling in `studies.paper.sampling_study`: the paper's, that with area weights, every pixel.
 PAPERS, WEIGHTED, FULL = "edge-clustered", "edge-clustered, area-weighted", "full map"
 
 

@@ -18,7 +18,7 @@ from studies.paper.control import LOOP_HYSTERESIS, OPEN_HYSTERESIS, Series
 from studies.paper.page.figures import NM
 from studies.paper.reported import CLAIM_PARTS, WAVELENGTH
 
-#: Errors below this are drawn here, m: far below the noise of any interferometer.
+#: Smaller errors are drawn at this value, m: far below the noise of any interferometer.
 FLOOR = 1e-11
 
 

@@ -33,7 +33,7 @@ def regions_figure(mirror: Mirror, plate_diameter: float) -> Figure:
     for number, share in reversed(list(enumerate(AREA_FRACTIONS))):
         axes.add_patch(Circle((0, 0), radius * np.sqrt(share), facecolor=shades(number), edgecolor="white"))
     edges = np.concatenate(([0.0], 100 * np.asarray(AREA_FRACTIONS)))
-    # Beside the aperture, where no label can touch an actuator.
+    # The colour bar is beside the aperture, where no label can touch an actuator.
     figure.colorbar(
         ScalarMappable(BoundaryNorm(edges, shades.N), shades),
         ax=axes,

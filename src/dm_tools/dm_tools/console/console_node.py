@@ -33,7 +33,7 @@ TOPICS = client.TOPICS | {
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
     "zernike": (ZernikeCoefficients, qos.STATE),
 }
-#: What the console has no button for.
+#: Services for which the console has no button.
 NOT_OFFERED = ("ingest_file", "update_calibration")
 WATCHED = {
     node: (kind, topic, profile, {name: served[name] for name in served if name not in NOT_OFFERED})
@@ -43,11 +43,11 @@ WATCHED = {
 LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 #: Lines of the log that are kept.
 LOG_LINES = 200
-#: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
+#: A node whose diagnostics were not heard for this long counts as missing, s. Nodes publish once a second.
 SILENCE_S = 5.0
-#: Time for an answer that comes at once, s.
+#: Time limit for a service that answers at once, s.
 ANSWER_S = 10.0
-#: Time that runs back by more than this is another time: a simulator that was started again, s.
+#: ROS time that jumps back by more than this means that a simulator was restarted, s.
 TIME_JUMP_S = 60.0
 
 
@@ -58,8 +58,8 @@ class Snapshot:
     Attributes:
         calibration: in use; None = none is, or none was heard.
         diagnostics: {node: latest status}, of this namespace's nodes and others; STALE = no longer heard.
-        health: the same of the nodes of this namespace that were heard lately, by their names without it.
-        bench_time: s, ROS time as far as heard.
+        health: the same, only for nodes of this namespace that were heard lately, by their names without namespace.
+        bench_time: latest ROS time that was heard, s.
     """
 
     mirror_info: Any = None
@@ -85,15 +85,15 @@ class ConsoleNode:
 
     def __init__(self, namespace: str = "", domain: int | None = None) -> None:
         self._prefix = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
-        self._diagnostics: dict[str, tuple[DiagnosticStatus, float]] = {}  # and when they were heard
+        self._diagnostics: dict[str, tuple[DiagnosticStatus, float]] = {}  # with the monotonic time of arrival, s
         self._bench_time = 0.0
         self._timed = {f"{self._prefix}{name}" for name in NEEDED}  # others, and the simulation, may have another time
-        self._stops: dict[str, threading.Event] = {}  # of the goals that run; once set they are cancelled
+        self._stops: dict[str, threading.Event] = {}  # of the running goals; setting one cancels its goal
         self.observer = StateObserver()
         self._connection = Connection("dm_console", namespace, domain, TOPICS, WATCHED, self._take)
         self.node = self._connection.node
         self.log: deque[tuple[str, str, str, str]] = deque(maxlen=LOG_LINES)
-        # Nodes offer their latest lines to those who come late.
+        # Transient local: nodes repeat their latest lines to late subscribers.
         profile = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(Log, "/rosout", self._take_line, profile)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
@@ -176,7 +176,7 @@ class ConsoleNode:
         except DeformableMirrorError as error:
             if error.response is not None:
                 raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
-            if watched is not None:  # it may run all the same: then it must be seen, and be cancelled from here
+            if watched is not None:  # the goal may run nevertheless: then it must be shown, and be cancellable
                 watched.disown(identity)
             raise
         finally:
@@ -184,18 +184,18 @@ class ConsoleNode:
 
     @property
     def external_action(self) -> str:
-        """Name of an action that runs and was not started here; "" = none."""
+        """Name of a running action that was not started here; "" = none."""
         return next((name for name, watch in self.watched.items() if watch.running), "")
 
     async def cancel(self, name: str) -> None:
-        """Ask the goal that runs for `name`, if one does, to stop, whoever sent it.
+        """Ask the running goal of `name`, if there is one, to stop, whichever client sent it.
 
         Raises Refusal when there is no answer, or the node does not know the goal.
         """
         own, watched = self._stops.get(name), self.watched.get(name)
         if own is not None:
             own.set()
-        # While one from here is about to begin, that of somebody else goes on.
+        # While a goal of this console is starting, the goal of another client is not cancelled.
         asked = None if watched is None or (own is not None and watched.running) else watched.cancel()
         if asked is None:
             return

@@ -1,4 +1,4 @@
-"""Hysteresis loops of one actuator: what the law of the calibration says, and what maps say."""
+"""Hysteresis loops of one actuator, from the law of the calibration and from maps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from dm_tools.console.view_models import moved
 
 #: Points of each branch of a loop.
 STEPS = 41
-#: A measured way in shares of the amplitude: up, back through the start, down, and back.
+#: Signals of a measured loop relative to its start, in units of the amplitude: up, back, down, and back.
 WAY = (0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)
 
 
@@ -21,9 +21,9 @@ class Loop:
     """A hysteresis loop of one actuator, effective over applied signal.
 
     Attributes:
-        signals, rising, falling: the closed cycle of the law over the whole range.
+        signals, rising, falling: the closed cycle over the whole range by the law: signals, effective signals.
         stands: (signal, effective signal) now; None = not known.
-        path, modelled_path, measured: a measured way, what the law says of it and what came; may be empty.
+        path, modelled_path, measured: signals of a measured loop, effective signals by law and by maps; may be empty.
     """
 
     actuator: int
@@ -50,16 +50,16 @@ def modelled_loop(law: HysteresisModel, actuator: int, low: float, high: float) 
 
 
 def way(start: float, amplitude: float, low: float, high: float) -> list[float]:
-    """Signals of a measured loop around `start`, which it ends at, inside `low` .. `high`.
+    """Signals of a measured loop around `start`, inside `low` .. `high`; the loop ends at `start`.
 
-    Raises ValueError when the amplitude leads out of the range either way.
+    Raises ValueError when the amplitude leads out of the range in both directions.
     """
     moved(start, amplitude, low, high)
     return [min(max(start + amplitude * share, low), high) for share in WAY]
 
 
 def modelled_way(law: HysteresisModel, state: HysteresisState, actuator: int, signals: Sequence[float]) -> list[float]:
-    """Effective signals of one actuator (1-based) when it goes from `state` through `signals`; creep stands still."""
+    """Effective signals of one actuator (1-based) that goes from `state` through `signals`, without further creep."""
     values = []
     shape = state.signals.copy()
     for signal in signals:
@@ -71,7 +71,7 @@ def modelled_way(law: HysteresisModel, state: HysteresisState, actuator: int, si
 
 
 def effective_change(before: Any, after: Any, calibration: Any, actuator: int) -> float:
-    """By how much the effective signal of one actuator (1-based) changed between two maps.
+    """Change of the effective signal of one actuator (1-based) between two maps.
 
     Args:
         before, after: dm_msgs/SurfaceSamples at the points of the calibration.

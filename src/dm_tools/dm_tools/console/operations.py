@@ -17,10 +17,10 @@ from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
 from dm_tools.long_actions import warning_in
 
-#: Between a command and its map, s, as `settle_time` of the calibration is by default.
+#: Wait between a command and its map, s: the default of the calibration's `settle_time`.
 SETTLE_S = 0.5
 
-#: What the plans of a calibration are called.
+#: Labels of the plans of a calibration.
 PLANS = {
     Calibrate.Goal.PLAN_HYSTERESIS: "Hysteresis: influence function, hysteresis and creep",
     Calibrate.Goal.PLAN_FULL: "Full: pokes and the surfaces of Table 1",
@@ -37,7 +37,7 @@ async def predict(session: Session, request: FocusRequest) -> str:
 
 
 async def move(session: Session, request: FocusRequest) -> str:
-    """Take the curvature of `request`."""
+    """Move to the curvature of `request`."""
     result = await session.run("move_focus", MoveFocus.Goal(request=request))
     session.base = None
     return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_text(result.state)}"
@@ -114,12 +114,12 @@ def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:
 
 
 async def _set_signals(session: Session, signals: list[float]) -> None:
-    """Set all signals and wait until they stand, as long as the way takes. Raises Refusal."""
+    """Set all signals and wait, however long it takes, until the mirror has reached them. Raises Refusal."""
     await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), math.inf, again=True)
 
 
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
-    """Move one actuator away from the shape that stood before the first poke."""
+    """Move one actuator away from the shape before the first poke."""
     mirror, requested = _mirror_and_signals(session)
     still_poked = np.array_equal(requested, session.poked)
     base = session.base if session.base is not None and still_poked else requested
@@ -134,7 +134,7 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
 
 
 async def release(session: Session) -> str:
-    """Go back to the shape that stood before the poke."""
+    """Go back to the shape before the poke."""
     base, (_, requested) = session.base, _mirror_and_signals(session)
     if base is None:
         return "nothing is poked"

@@ -13,11 +13,11 @@ from dm_tools.console.widgets.focus import FocusCard
 from dm_tools.console.widgets.messages import DiagnosticsCard, Header, LogCard
 from dm_tools.console.widgets.surfaces import SurfaceCard, ZernikeCard
 
-#: Only this machine; a web site elsewhere must not reach the mirror through the browser either, hence the host names.
+#: Loopback only. The check of host names also keeps foreign web sites from reaching the mirror through the browser.
 HOST = "127.0.0.1"
 HOST_NAMES = [HOST, "localhost"]
 REFRESH_S = 0.3
-#: A page that was not served for so long is loaded anew and forgets what was typed, s: long for a phone that dozed off.
+#: A page that was disconnected for longer is reloaded and loses typed values, s; long enough for a sleeping phone.
 RECONNECT_S = 60.0
 
 
@@ -28,14 +28,14 @@ def serve(ros: ConsoleNode, port: int) -> None:
     ui.page("/")(lambda: build(session, view))
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOST_NAMES)
     app.on_shutdown(session.end)
-    # Quasar's bar of what is being fetched has no name for a screen reader, and says nothing about the mirror.
+    # Quasar's loading bar has no name for screen readers, and says nothing about the mirror.
     app.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run(
         host=HOST,
         port=port,
         title="Deformable mirror console",
         language="en-GB",
-        dark=None,  # as the system has it
+        dark=None,  # as set in the system
         reload=False,
         show=False,
         show_welcome_message=False,

@@ -11,10 +11,10 @@ from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import Loop
 from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
-#: Messages are shown so long, s of wall time, unless somebody dismisses them before; the log keeps failures.
+#: Messages are shown for this time unless dismissed before, s of wall time; the log keeps failures.
 SHOWN_S = 120.0
 FAILURES_KEPT = 50
-#: What an action that was not started here is called.
+#: Titles of actions that were not started here.
 EXTERNAL = {
     "build_recipes": "A run of recipes that was started elsewhere",
     "calibrate": "A calibration that was started elsewhere",
@@ -24,7 +24,7 @@ EXTERNAL = {
 
 @dataclass(frozen=True)
 class Failure:
-    """Something that was refused or went wrong; `ends` is when it is shown no more, s of the steady clock."""
+    """Something that was refused or went wrong; shown until `ends`, s of the monotonic clock."""
 
     clock: str
     title: str
@@ -50,7 +50,7 @@ class Progress:
     can_cancel: bool = False
 
     def take(self, action: str, feedback: Any, goal: Any = None) -> None:
-        """Show the feedback of an action; `goal` = None: somebody else's, which is not known."""
+        """Show the feedback of an action; `goal` = None: another client's, whose goal is not known."""
         match action:
             case "move_focus":
                 self.step, self.steps = round(100 * feedback.progress), 100
@@ -93,7 +93,7 @@ class Session:
     cancelled: bool = False
 
     def snapshot(self) -> Snapshot:
-        """What is known of the bench now; messages whose time is over go."""
+        """What is known of the bench now; also removes messages whose time is over."""
         now = time.monotonic()
         self.failures[:] = [failure for failure in self.failures if failure.ends > now]
         if now > self._outcome_ends:
@@ -112,7 +112,7 @@ class Session:
 
     @property
     def shown_progress(self) -> Progress:
-        """The operation under way here, else the one elsewhere."""
+        """Progress of the operation under way here, otherwise of the one elsewhere."""
         name = self.ros.external_action
         if self.progress.title or not name:
             return self.progress
@@ -142,9 +142,9 @@ class Session:
         """Start an operation; when another is under way, say so instead.
 
         Args:
-            operation: called with this session and what `wish` says, if there is one; returns its outcome in words.
+            operation: called with this session and the result of `wish`, if given; returns its outcome in words.
                 Both raise Refusal or ValueError with the sentence to show.
-            cancel: the action that stops it; "" = it looks at `cancelled` itself, None = it cannot be stopped.
+            cancel: the action that is cancelled to stop it; "" = it reads `cancelled` itself, None = cannot be stopped.
         """
         if self.running:
             self.fail(title, f"not begun: {self.running} is under way")
@@ -162,7 +162,7 @@ class Session:
             self._outcome_ends = time.monotonic() + SHOWN_S
         except (Refusal, ValueError) as error:
             self.fail(title, str(error))
-        except Exception as error:  # a defect of the console must be seen, too
+        except Exception as error:  # a defect of the console must be visible, too
             self.fail(title, f"{type(error).__name__}: {error}")
             raise
         finally:
@@ -185,7 +185,7 @@ class Session:
             self.fail("Cancel", str(error))
 
     async def end(self) -> None:
-        """Cancel what is under way here and wait for its end, for a shutdown in order."""
+        """Cancel the operation under way here and wait for its end, for an orderly shutdown."""
         if self.progress.title:
             await self.cancel()
         if self._task is not None and not self._task.done():

@@ -13,9 +13,9 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import ESTIMATES_KEPT, ActuatorEstimate
 from dm_common.messages import estimate_from, hysteresis_model_from, seconds
 
-#: Creep of what was held unseen is told above this standard deviation, in shapes of the whole range.
+#: Creep left by unobserved shapes is reported above this standard deviation, in shapes of the whole range.
 CREEP_UNSEEN = 0.05
-#: A move that the controller has not followed after this is one it does not follow, s.
+#: A move that is not in the controller's estimate after this time counts as not followed, s.
 LATE_S = 1.0
 
 
@@ -24,21 +24,21 @@ class EffectiveSignals(NamedTuple):
 
     Attributes:
         effective: (N,); None = not known.
-        doubt: the reason why it is a guess only or not known; "" = it is known.
+        doubt: the reason why it is only a guess or not known; "" = it is known.
     """
 
     effective: Floats | None
     doubt: str
 
     def near(self, other: EffectiveSignals, tolerance: float = 0.0) -> bool:
-        """Whether both say the same, with signals that differ by no more than `tolerance`."""
-        mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))  # None = one NaN
+        """Whether both have the same doubt, and signals that differ by no more than `tolerance`."""
+        mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))  # None becomes NaN
         alike = self.doubt == other.doubt and mine.shape == theirs.shape
         return alike and np.allclose(mine, theirs, rtol=0.0, atol=tolerance, equal_nan=True)
 
 
 class StateObserver:
-    """Keeps the latest estimates of one mirror. May be asked from any thread.
+    """Keeps the latest estimates of one mirror. May be queried from any thread.
 
     Attributes:
         law: of the calibration; the linear one when no hysteresis was identified.
@@ -47,12 +47,12 @@ class StateObserver:
 
     def __init__(self) -> None:
         self.law, self.fault = HysteresisModel.linear(), ""
-        self._calibration = ""  # its id: later maps make a new revision, and leave the law as it is
+        self._calibration = ""  # its id; an update by later maps is a new revision with the same law
         self._estimates: deque[tuple[str, ActuatorEstimate]] = deque(maxlen=ESTIMATES_KEPT)
         self._reported: Any = None
 
     def use(self, calibration: Any) -> None:
-        """Show what a dm_msgs/Calibration says from now on."""
+        """Use a dm_msgs/Calibration from now on."""
         try:
             law, self.fault = hysteresis_model_from(calibration.hysteresis), ""
         except ValueError as error:
@@ -78,12 +78,12 @@ class StateObserver:
 
     @property
     def creep_unseen(self) -> bool:
-        """Whether actuators creep from what was held before the controller followed it."""
+        """Whether creep is expected from shapes that were held before the controller followed the mirror."""
         state = self.latest().state
         return state is not None and bool((state.crept_sigma > CREEP_UNSEEN).any())
 
     def now(self, time: float) -> EffectiveSignals:
-        """The mirror at `time` (s, ROS time), taken as not before the last estimate."""
+        """Effective signals at `time` (s, ROS time), taken as no earlier than the last estimate."""
         estimate, reported = self.latest(), self._reported
         if estimate.state is not None and not estimate.unknown and reported is not None and not reported.moving:
             applied = np.array(reported.applied)
@@ -93,7 +93,7 @@ class StateObserver:
         return self._settled(estimate, time)
 
     def at(self, time: float) -> EffectiveSignals:
-        """The mirror at `time` (s), which may lie before the last estimate."""
+        """Effective signals at `time` (s), which may lie before the last estimate."""
         return self._settled(self._before(time), time)
 
     def _before(self, time: float) -> ActuatorEstimate:

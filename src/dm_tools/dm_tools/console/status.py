@@ -30,7 +30,7 @@ _PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|wor
 
 
 def shortened(text: str) -> str:
-    """`text` with only the last part of every path in them: who reads the page knows the folders."""
+    """Shorten every path in `text` to its last part: readers of the page know the folders."""
     return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", text)
 
 
@@ -62,7 +62,7 @@ def badges(snapshot: Any, doubt: str) -> list[tuple[str, str]]:
 
 
 def missing(present: Collection[str], mirror_known: bool) -> list[str]:
-    """What is not there of the nodes and the mirror, and what follows from it, in sentences."""
+    """Sentences on the nodes and the mirror information that are missing, and on the consequences."""
     if not NEEDED.keys() & present:
         return ["No node of the suite is heard. Start them (./dm up) or check the namespace and the ROS domain."]
     lines = [f"The node {name} is not heard: {effect}." for name, effect in NEEDED.items() if name not in present]
@@ -128,7 +128,7 @@ def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> li
 
 
 def now_text(snapshot: Any) -> str:
-    """Where the mirror stands, in one line."""
+    """Present state of the mirror, in one line."""
     state = snapshot.actuator_state
     for name in ("pdm_driver", "focus_controller"):
         if name not in snapshot.health or state is None:

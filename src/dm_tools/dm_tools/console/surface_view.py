@@ -1,4 +1,4 @@
-"""The latest map beside what the calibration predicts; worked out once for all open pages."""
+"""The latest map beside the prediction of the calibration; computed once for all open pages."""
 
 from typing import Any
 
@@ -12,19 +12,19 @@ from dm_tools.verify import map_of
 NO_CALIBRATION = "No calibration is in use: nothing can be predicted."
 MOVED = "The mirror has moved since this map; all three are of the moment of the map."
 CREEP_BEFORE = "Creep of what was held before the focus controller followed it is not known."
-#: Effective signals that differ less do not count as a move: creep, and steps of holding a shape against it.
+#: Smaller changes of the effective signals do not count as a move: creep, and corrections that hold a shape against it.
 SMALL_MOVE = 2e-3
 #: The prediction is drawn again when an effective signal has changed by this much, normalised.
 DRAWN_AGAIN = 1e-4
 
 
 class SurfaceView:
-    """What is shown of the surface.
+    """The surfaces that are shown, and remarks on them.
 
     Attributes:
         version: rises whenever something changed.
-        measured, predicted, difference: or why there is none. `predicted` is for now, `difference` for the moment of
-            the map.
+        measured, predicted, difference: surfaces, or the reason why there is none. `predicted` is for now,
+            `difference` for the moment of the map.
         predicted_then: for the moment of the map; None = not known.
         predicted_zernike: (K,) m for the moment of the map; None = not known.
         remark: on what the prediction leaves out, in words; "" = nothing.
@@ -47,13 +47,13 @@ class SurfaceView:
 
     @property
     def doubt(self) -> str:
-        """Why the prediction is a guess only, in words; "" = it is none."""
+        """Why the prediction is only a guess, in words; "" = it is not."""
         return self._now.doubt
 
     def update(self, snapshot: Snapshot) -> None:
-        """Take what is new."""
+        """Take new messages and estimates, and compute the surfaces again if they have changed."""
         new = self._take_calibration(snapshot.calibration) | self._take_map(snapshot)
-        then = self._observer.at(1e-9 * self.stamp)  # an estimate may come after the map it is older than
+        then = self._observer.at(1e-9 * self.stamp)  # the estimate for the time of the map may arrive after the map
         now = self._observer.now(snapshot.bench_time)
         if new or not (then.near(self._then) and now.near(self._now, DRAWN_AGAIN)):
             self._then, self._now = then, now
@@ -82,7 +82,7 @@ class SurfaceView:
         return True
 
     def _draw(self) -> None:
-        """Work out what is shown."""
+        """Compute what is shown."""
         self.predicted_then = self.predicted_zernike = None
         self.when = ""
         if isinstance(self._model, str):

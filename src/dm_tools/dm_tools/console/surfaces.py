@@ -32,7 +32,7 @@ def _disc() -> tuple[Floats, Floats, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Sag over the aperture, piston and tilt removed; some of it is known.
+    """Sag over the aperture, piston and tilt removed; at least one point is known.
 
     Attributes:
         sag: (GRID, GRID) m, row 0 = top, NaN = no data or outside the aperture.
@@ -54,14 +54,14 @@ class Surface:
 
     @cached_property
     def extent(self) -> float:
-        """m, largest magnitude."""
+        """Largest magnitude, m."""
         return float(np.nanmax(np.abs(self.sag)))
 
 
 def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
-    """A map on the grid: means over the pixels around each point.
+    """Resample a map on the grid: means over the pixels around each point.
 
-    Points without `VALID_SHARE` of their pixels hold no data: a mean over one side would be off by the slope.
+    Points with a smaller valid share than `VALID_SHARE` become NaN: a mean over one side would be off by the slope.
 
     Args:
         sag: (H, W) m, row 0 = top, NaN = no data.
@@ -74,7 +74,7 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
         raise ValueError(f"surface_map_info: aperture_radius_px = {radius:g}: must be positive")
     x, y, shown = _disc()
     places = info.centre_y - radius * y, info.centre_x + radius * x
-    around = 2 * round(radius / (GRID - 1)) + 1  # odd: a mean must be of what lies about its middle
+    around = 2 * round(radius / (GRID - 1)) + 1  # odd, so that the window is centred on the point
     valid = np.isfinite(sag)
     share, mean = (
         map_coordinates(uniform_filter(values.astype(np.float32), around, mode="constant"), places, order=1)
@@ -86,9 +86,9 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
 
 
 class SurfaceModel:
-    """What a calibration predicts, on the grid. Shapes: N actuators, K terms.
+    """The surface that a calibration predicts, on the grid. Shapes: N actuators, K terms.
 
-    Between the sampling points the sag is that of a thin plate through them.
+    Between the sampling points the sag is interpolated by a thin-plate spline.
 
     Raises ValueError, naming the field, for arrays of the calibration that do not fit together.
     """

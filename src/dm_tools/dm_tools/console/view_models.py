@@ -17,7 +17,7 @@ from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
 SIGMAS_95 = 1.96
-#: Most recipes of one run.
+#: Largest number of recipes in one run.
 NUMBER_MAX = 1000
 SIGNAL_COLOURS = "cividis"
 QUALITIES = {
@@ -42,7 +42,7 @@ class Cell:
         signal: normalised; None = nothing commanded yet.
         fill: colour.
         remarks: flags and grade in words.
-        mark: one sign that stands for the first of them, "" = none.
+        mark: the symbol of the first of them, "" = none.
     """
 
     number: int
@@ -69,7 +69,7 @@ def luminance(colour: str) -> float:
 
 def ink_on(colour: str) -> str:
     """Black or white, whichever stands out more; the contrast is at least 4.5 to 1 on any colour."""
-    # (L + 0.05) / 0.05 against 1.05 / (L + 0.05)
+    # The contrast is (L + 0.05) / 0.05 with black and 1.05 / (L + 0.05) with white.
     return "#000000" if (luminance(colour) + 0.05) ** 2 > 0.05 * 1.05 else "#ffffff"
 
 
@@ -152,7 +152,7 @@ class Bar:
 
 
 def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Bar]:
-    """Coefficients beyond tilt of a dm_msgs/ZernikeCoefficients; empty when it has no known form.
+    """Coefficients beyond tilt of a dm_msgs/ZernikeCoefficients; empty when their number or values are not valid.
 
     Args:
         predicted: (K,) m for the moment of the map; None = not known.
@@ -205,9 +205,9 @@ def prediction_text(state: Any) -> str:
 
 
 def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: float, high: float) -> list[float]:
-    """`base` (N,) with one actuator (1-based) moved by `amplitude`, or the other way where the range ends.
+    """`base` (N,) with one actuator (1-based) moved by `amplitude`, in the other direction where the range ends.
 
-    Raises ValueError when there is no such actuator, or the amplitude leads out of the range either way.
+    Raises ValueError when there is no such actuator, or both directions lead out of the range.
     """
     if not 1 <= actuator <= len(base):
         raise ValueError(f"actuator = {actuator}: must be 1 to {len(base)}")
@@ -217,7 +217,7 @@ def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: fl
 
 
 def moved(signal: float, amplitude: float, low: float, high: float) -> float:
-    """`signal` moved by `amplitude`, or the other way where the range ends. Raises ValueError when both lead out."""
+    """`signal` moved by `amplitude`, in the other direction where the range ends. Raises ValueError when both fail."""
     for there in (signal + amplitude, signal - amplitude):
         if low <= there <= high:
             return there
@@ -225,7 +225,7 @@ def moved(signal: float, amplitude: float, low: float, high: float) -> float:
 
 
 def decimal(text: str | None) -> float | None:
-    """The number in `text`, whose decimal sign may be a comma; None = there is none."""
+    """The number in `text`, with a decimal point or comma; None = not a number."""
     try:
         value = float(with_point(text or ""))
     except ValueError:
@@ -234,7 +234,7 @@ def decimal(text: str | None) -> float | None:
 
 
 def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
-    """`number` curvatures from `first` to `last`, 1/m. Raises ValueError naming the field that makes no sense."""
+    """`number` curvatures from `first` to `last`, 1/m. Raises ValueError naming the field that is not valid."""
     for name, value in (("first", first), ("last", last), ("number", number)):
         if value is None or not math.isfinite(value):
             raise ValueError(f"{name}: must be a number")
@@ -247,7 +247,7 @@ def evenly(first: float | None, last: float | None, number: float | None) -> lis
 
 
 def calibration_text(calibration: Any) -> list[str]:
-    """A dm_msgs/Calibration in lines: what it is and how good; None = none is in use."""
+    """Lines that describe a dm_msgs/Calibration and its accuracy; None = no calibration is in use."""
     if calibration is None:
         return ["No calibration is in use."]
     lines = [

@@ -1,4 +1,4 @@
-"""What `dm demo --camera` has the camera do: searches, a focus stack, tracking; and the images of it."""
+"""What `dm demo --camera` has the camera do: searches, a focus stack, tracking; and the images taken meanwhile."""
 
 import math
 import time
@@ -19,16 +19,16 @@ from dm_common.ros import qos
 from dm_tools.output import console, progress_bar
 from dm_tools.verbs.up import DISTANCES
 
-#: How fast the nearest object comes nearer [m/s] until it is so far away [m].
+#: Speed at which the nearest object approaches [m/s], and the distance at which it stops [m].
 SPEED, NEAREST = 0.7, 4.5
 #: Time for the mirror to settle before an image is looked at, s.
 SETTLE_S = 0.3
-#: Images that wait for what `autofocus_state` says of them.
+#: Number of images kept until `autofocus_state` reports on them.
 WAITING = 60
 
 
 class Shot(NamedTuple):
-    """One counted image: grey levels (H, W), curvature [1/m] and sharpness."""
+    """One image that the autofocus evaluated: grey levels (H, W), curvature [1/m] and sharpness."""
 
     image: NDArray[np.uint8]
     curvature: float
@@ -41,9 +41,9 @@ class Focused(NamedTuple):
     Attributes:
         distance: true distance of the object [m].
         result: what the action answered.
-        shots: counted images in order.
+        shots: evaluated images in order.
         final: the image after the search.
-        by_distance: sharpness after `set_focus_distance` with the true distance, without looking.
+        by_distance: sharpness after `set_focus_distance` with the true distance, without a search.
     """
 
     distance: float
@@ -55,7 +55,7 @@ class Focused(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """Tracking of the first object while it comes nearer: counted images, and its true distance at each [m]."""
+    """Tracking of the first object while it approaches: evaluated images, and its true distance at each [m]."""
 
     shots: list[Shot]
     distances: list[float]
@@ -65,10 +65,10 @@ class Sweep(NamedTuple):
     """A focus stack.
 
     Attributes:
-        shots: its images, in order of the curvature.
+        shots: its images, in order of curvature.
         sharp: image that is sharp everywhere (H, W).
         depth: distances (H, W) [m].
-        seconds: that it took.
+        seconds: duration [s].
     """
 
     shots: list[Shot]
@@ -78,7 +78,7 @@ class Sweep(NamedTuple):
 
 
 class Recorder:
-    """Keeps the images that counted, with what `autofocus_state` says of them."""
+    """Keeps the images that the autofocus evaluated, with the curvature and sharpness from `autofocus_state`."""
 
     def __init__(self, client: CameraFocusClient) -> None:
         self._client = client

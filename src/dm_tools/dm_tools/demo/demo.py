@@ -29,7 +29,7 @@ from dm_tools.output import (
     write_json,
 )
 
-#: Of the identification of hysteresis and creep.
+#: Default number of maps for the identification of hysteresis and creep.
 MAPS = 200
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
@@ -60,7 +60,7 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 
 
 def curvatures_of(capabilities: Any) -> tuple[float, ...]:
-    """Curvatures [1/m] of the sweep: the article's, or eleven over the range of a mirror that does not reach those.
+    """Curvatures [1/m] of the sweep: those of [1], or eleven over the range of a mirror that does not reach them.
 
     Raises RuntimeError when it reaches none.
     """
@@ -73,7 +73,7 @@ def curvatures_of(capabilities: Any) -> tuple[float, ...]:
 
 
 def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> float:
-    """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
+    """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, according to the model."""
     from dm_controller.planning.active_calibration import active_calibration
     from dm_controller.planning.target import FocusTarget
 
@@ -82,7 +82,7 @@ def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> f
 
 
 def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
-    """Ask for each curvature, measure what came, and compare."""
+    """Request each curvature, measure the surface, and compare."""
     from dm_controller.planning.target import FocusTarget
     from dm_tools.verify import map_of, surface_error
 
@@ -99,7 +99,7 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
 
 
 def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> None:
-    """Print the table: predicted, re-measured, limit."""
+    """Print the table: predicted and re-measured errors, and the fitting limit."""
     from rich.table import Table
 
     table = Table(title=f"open-loop focus, {how}: predicted before the move, re-measured after it")
@@ -191,7 +191,7 @@ def demo(
     folder = usable_folder(out)
     if map_file is not None and (not map_file.is_file() or map_file.resolve().is_relative_to(folder)):
         raise ValueError(f"--map {map_file}: must be a file outside of the folder {out}, which is emptied")
-    config = bench_config(folder, hysteresis.value, creep, seed, speed, config_file)  # before that: it may be in there
+    config = bench_config(folder, hysteresis.value, creep, seed, speed, config_file)  # first: the file may be in `out`
     make_empty(folder)
     name = config["pdm_driver"].get("mirror.name", "PDM30-37")
     figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": creep, "seed": seed}

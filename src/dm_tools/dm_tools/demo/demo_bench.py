@@ -12,13 +12,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-#: A port of the virtual bench that is not offered.
+#: Value of a port that the virtual bench does not open.
 OFF = -1
-#: In the folder of a demo.
+#: Name of the file that marks the folder of a demo.
 MARK = ".dm_demo"
-#: Above those that Linux by default hands out to whoever asks for any (net.ipv4.ip_local_port_range).
+#: Above the default range of Linux's ephemeral ports (net.ipv4.ip_local_port_range).
 PORTS = range(61000, 65536)
-#: Parameters of a bench whose actuators follow one law.
+#: Parameters of a bench whose actuators all follow the same law.
 SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
 
 
@@ -35,8 +35,8 @@ class Hysteresis(StrEnum):
 def free_ports(count: int) -> list[int]:
     """Ports that are free on loopback now, for TCP and UDP alike.
 
-    Handed out in turn over all processes of this user: what was drawn at random could be another's choice as well, as
-    long as neither had bound it. Raises RuntimeError when there are not so many.
+    They are handed out in turn over all processes of this user: another process could draw the same port at random
+    while neither has bound it. Raises RuntimeError when fewer than `count` are free.
     """
     ports: list[int] = []
     with (Path(tempfile.gettempdir()) / f"dm-ports-{os.getuid()}").open("a+") as turn:
@@ -62,12 +62,12 @@ def bench_config(
     """A configuration of a virtual bench with ports and folders of this run's own, and time `speed` times as fast.
 
     Args:
-        law: of all actuators, `off` = none; where its name begins with `drawn`, loops and creep differ between them.
+        law: of all actuators, `off` = none; with a name that begins with `drawn`, they differ in loops and creep.
         source: the parameter file; None = the shipped bench.
 
     Raises:
         ConfigError: the file cannot be used.
-        ValueError: it has no virtual bench, or the parts of one that a run changes are missing.
+        ValueError: it lacks the virtual bench, a node, or another part that a run changes.
     """
     from dm_bringup.suite import load_config
     from dm_tools.verbs.up import move_trigger, shared_config
@@ -98,7 +98,7 @@ def bench_config(
     config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
     (folder / "maps").mkdir(parents=True, exist_ok=True)
     if speed > 0:
-        if law == "off":  # such actuators care for no time between two ticks, each of which wakes every node
+        if law == "off":  # such actuators need no finer time step, and every tick wakes every node
             bench["clock.period"] = 0.02
         # Ages are in ROS time, in which the same delay between two processes is `speed` times as long.
         config["pdm_driver"] |= {"limits.command_age": max(1.0, speed), "limits.command_lead": max(0.5, speed)}
@@ -109,7 +109,7 @@ def bench_config(
 
 
 def usable_folder(path: Path) -> Path:
-    """The folder of a demo, absolute. Raises ValueError where something else than a demo has left anything there."""
+    """The folder of a demo, absolute. Raises ValueError when it holds anything that is not from a demo."""
     folder = path.resolve()
     if folder.exists() and not (folder.is_dir() and ((folder / MARK).is_file() or not any(folder.iterdir()))):
         raise ValueError(
@@ -120,7 +120,7 @@ def usable_folder(path: Path) -> Path:
 
 
 def make_empty(folder: Path) -> None:
-    """Empty `folder`, see `usable_folder`, or make it; itself it stays, for it may be a mount, or where one stands."""
+    """Create or empty `folder` (see `usable_folder`); it is not replaced: it may be a mount or a working directory."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).write_text("made by dm demo, which empties this folder when it begins\n")
     for path in (path for path in folder.iterdir() if path.name != MARK):
@@ -144,13 +144,13 @@ def running_bench(config: dict[str, dict[str, Any]], logs: Path, domain: int, cl
 
 
 def wait_for_calibration(client: Any, identifier: str) -> None:
-    """Wait until the focus controller uses a calibration. Raises RuntimeError when it does not."""
+    """Wait until the focus controller uses a calibration. Raises RuntimeError if it does not."""
     if not client.wait(lambda: client.capabilities.calibration_id == identifier):
         raise RuntimeError("the focus controller did not take the new calibration")
 
 
 def identify_hysteresis(client: Any, maps: int, note: str) -> Any:
-    """Calibrate with hysteresis and creep from so many maps, and say what came of it; returns the action's result."""
+    """Calibrate with hysteresis and creep from `maps` maps and print the outcome; returns the action's result."""
     from dm_msgs.action import Calibrate
 
     from dm_tools.verbs.calibrate import made_by, run_calibration, show_result

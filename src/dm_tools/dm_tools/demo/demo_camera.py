@@ -26,7 +26,7 @@ from dm_tools.output import console, next_step, write_json
 from dm_tools.verbs import calibrate
 from dm_tools.verbs.up import DISTANCES, RATE, add_camera
 
-#: Of the calibration: fewer and smaller maps than a bench would take, for a quick demonstration.
+#: Number of maps of the calibration and their width [pixels]: less than on a bench, for a quick demonstration.
 MAPS, PIXELS = 120, 472
 
 
@@ -90,7 +90,7 @@ def demo_camera(law: str, creep: float, seed: int, speed: float, out: Path, json
         with running_bench(config, folder / "calibration", domain, DeformableMirrorClient) as client:
             calibrated = identify_hysteresis(client, MAPS, "camera")
     shutil.rmtree(folder / "maps")
-    # A domain of its own: the first suite's time ran ahead, and nothing of it must be taken for news.
+    # A new domain: the first suite's time ran ahead, and none of its messages must pass for a recent one.
     with own_domain() as domain:
         config = camera_config(folder, law, creep, seed)
         with running_bench(config, folder / "camera", domain, CameraFocusClient) as camera:

@@ -21,9 +21,9 @@ from dm_tools.demo.camera_runs import Approach, Focused, Shot, Sweep
 
 #: Okabe-Ito, one per object.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: Images on which the animation rests at the end of each search.
+#: Number of frames for which the animation rests at the end of each search.
 HOLD = 14
-#: Colours and greys of the animation, the same in all its images.
+#: Numbers of colours and of greys in the palette that all frames share.
 PALETTE, GREYS = 32, 48
 
 
@@ -82,7 +82,7 @@ def save_animation(
     _sharpness_axes(right, found)
     clouds = [right.plot([], [], "o", color=colour, markersize=3)[0] for colour in COLOURS[: len(found)]]
     cursor = right.axvline(0.0, color="black", linewidth=0.8)
-    # What stands still: a cross on the middle of the picture.
+    # A cross on the middle of the picture shows that it stands still.
     height, width = sweep.sharp.shape
     cross = left.axhline(height / 2), left.axvline(width / 2)
     plt.setp(cross, color="#F0E442", linewidth=0.8, visible=False)
@@ -150,7 +150,7 @@ def save_animation(
         figure.set_layout_engine("none")  # else every frame is laid out anew
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     durations = [1000 * frames // frames_per_second for _, _, frames in schedule]
-    # One palette for all: the colours of those on which the animation rests, and greys for the pictures.
+    # One palette for all frames: the colours of those on which the animation rests, and greys for the pictures.
     rests = [image for image, (_, _, frames) in zip(images, schedule, strict=True) if frames > 1]
     sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in rests]))
     palette = sheet.quantize(PALETTE, Image.Quantize.MAXCOVERAGE)

@@ -22,7 +22,7 @@ UNSET = "CHANGE"
 DAY_S = 86400.0
 #: Parameters that every node has.
 COMMON = ("use_sim_time",)
-#: What the virtual bench listens to.
+#: Ports that the virtual bench opens, by their parameters, and their protocols.
 BENCH_PORTS = {
     "electronics.tcp_port": "TCP",
     "electronics.udp_port": "UDP",
@@ -32,7 +32,7 @@ BENCH_PORTS = {
 
 
 def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
-    """Those that the file calls for, of the mirror in this namespace; "" = in any."""
+    """Checks that the file calls for, of the mirror in this namespace; "" = in any."""
     try:
         config = load_config(file, namespace.strip("/"))
     except ConfigError as error:
@@ -46,7 +46,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
     for node in nodes_of(config):
         if node.configuring:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
-    # Wrong values are reported already: what is tried goes by the others.
+    # Wrong values have been reported above; the checks below use only the valid ones.
     sound = {node: sound_values(node, values) for node, values in config.items()}
     yield "aperture of the maps", lambda: aperture_fits(sound)
     driver = sound.get("pdm_driver", {})
@@ -68,7 +68,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
 
 
 def sound_values(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a node's values that are given and allowed."""
+    """The values of a node that are set and valid."""
     known, problems = _known(node), _problems(node, values)
     return {name: value for name, value in values.items() if name in known and value != UNSET and name not in problems}
 
@@ -85,7 +85,7 @@ def _known(name: str) -> dict[str, Parameter]:
 
 
 def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a node that is started with those `given`."""
+    """All values of a node: those `given`, and defaults for the others."""
     return {item.name: item.default for item in _known(name).values()} | dict(given)
 
 
@@ -102,14 +102,14 @@ def own_values(config: Config) -> Finding | None:
 
 
 def parameters(config: Config) -> Finding | None:
-    """Names nobody knows, wrong types, values out of their range; all of them at once."""
+    """Report unknown names, wrong types and values out of range, all of them at once."""
     wrong = [f"{node}: {text}" for node, values in config.items() for text in _problems(node, values).values()]
     cure = "correct the file; docs/parameters.md lists every parameter with its range"
     return Finding("; ".join(wrong), cure) if wrong else None
 
 
 def _problems(node: str, values: Mapping[str, Any]) -> dict[str, str]:
-    """What is wrong with the values of a node, by their names; what is still to be set is not among them."""
+    """What is wrong with the values of a node, by parameter name; values that are still to be set are left out."""
     known, found = _known(node), {}
     for name, value in values.items():
         if name in known and value != UNSET:
@@ -123,7 +123,7 @@ def _problems(node: str, values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
-    """Whether the values of `node` fit each other, by the function with which it configures itself."""
+    """Check that the values of `node` fit each other, with the function by which the node configures itself."""
     own, configuring = {node.name: config.get(node.name, {})}, node.load_configuring()
     missing = node.name == "pdm_driver" and required_parameters(config)
     if configuring is None or missing or own_values(own) or parameters(own):
@@ -146,7 +146,7 @@ def aperture_fits(config: Config) -> Finding | None:
 
 
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Ports that the bench wants and that others hold; None = all are free. A wrong value is passed over."""
+    """Ports of the bench that other programs hold; None = all are free. A wrong value is skipped."""
     sound, taken = sound_values("virtual_bench", bench), []
     values = effective("virtual_bench", sound)
     for name, protocol in BENCH_PORTS.items():
@@ -170,10 +170,10 @@ def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
 
 
 def watched_folder(folder: Path, written: bool, made: bool) -> Finding | None:
-    """Whether maps can be read there, and written when a command is to write them there.
+    """Check that maps can be read in `folder`, and written if a trigger command writes them there.
 
     Args:
-        written: a trigger writes maps there for us.
+        written: the trigger command writes maps there.
         made: a virtual bench makes the folder when it starts.
     """
     if made and not folder.exists():
@@ -200,7 +200,7 @@ def writable_folder(folder: Path) -> Finding | None:
 
 
 def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding | None:
-    """Whether there is a readable calibration of this mirror, measured or agreed with in the last `stale_after`, s."""
+    """Check for a readable calibration of this mirror that was measured or confirmed in the last `stale_after` s."""
     from dm_calibration.recalibration.check_log import SUFFIX, read_checks
     from dm_calibration.store.calibration_store import CalibrationStore
 

@@ -8,7 +8,7 @@ import typer
 from dm_tools.doctor.machine import LINK_LOST, Finding, machine_checks
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 
-#: Checks of what only one can have at a time: the nodes, while they run.
+#: Names of checks of exclusive resources, which the nodes hold while they run: ports, and the drive unit.
 PORTS, UNIT = ("ports of the virtual bench",), ("electronics", "serial port")
 
 
@@ -47,7 +47,7 @@ def doctor(
 
 
 def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:
-    """What a check has found, which is no more than a note where the nodes of the bench run and hold it."""
+    """The finding of a check; only a note if running nodes of the bench hold what was checked."""
     said = (running or {}).get("problem", "")
     held = PORTS if LINK_LOST in said else (*PORTS, *UNIT)
     if finding is None or not check.startswith(held) or "pdm_driver" not in said.partition("; not running")[0]:

@@ -8,7 +8,7 @@ from typing import Any
 from dm_common.ros.domains import holders
 from dm_tools.doctor.machine import Check, Finding
 
-#: What helps where the link to electronics does not open that can be tried, by their kind.
+#: Cures for a link that does not open, for those kinds of electronics whose link can be tried.
 CURES = {
     "edac40_tcp": "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one "
     "client at a time: close the vendor's program, or stop the nodes that hold it",
@@ -17,7 +17,7 @@ CURES = {
 
 
 def electronics_checks(driver: Mapping[str, Any]) -> Iterator[Check]:
-    """Those that the parameters of the driver call for, all of them given."""
+    """Checks that the parameters of the driver, which are all given, call for."""
     kind, address = driver["electronics.kind"], driver["electronics.address"]
     if kind in CURES and address:
         yield f"electronics at {address}", lambda: opens(kind, driver)
@@ -30,7 +30,7 @@ def electronics_checks(driver: Mapping[str, Any]) -> Iterator[Check]:
 
 
 def opens(kind: str, driver: Mapping[str, Any]) -> Finding | None:
-    """Whether the link opens, by the class of the driver's with which it does; no output changes."""
+    """Try to open the link with the back end that the driver uses; no output changes."""
     from dm_driver.electronics import BACK_ENDS
     from dm_driver.electronics.base import ElectronicsSettings, LinkError
 

@@ -18,14 +18,14 @@ SHARED_MEMORY_MIN = 60e6
 DISK_MIN = 1e9
 #: What the suite keeps in ~/.ros unless configured otherwise.
 FOLDERS = ("dm_bench", "dm_calibrations")
-#: DDS takes its ports from the domain; above this they run into those that the system hands out.
+#: DDS derives its ports from the domain; above this value they overlap the ephemeral ports of the system.
 DOMAIN_MAX = 101
-#: A node announces itself once, then every few seconds.
+#: Time for nodes to find each other, s: a node announces itself once, then every few seconds.
 DISCOVERY_S = 3.0
-#: Commands that seem older than `limits.command_age` or further ahead than `limits.command_lead` are refused.
+#: Largest difference of clocks, s; commands beyond `limits.command_age` or `limits.command_lead` are refused.
 CLOCK_SKEW_S = 0.5
 REPORTS_S = 2.5
-#: What is said of a driver that runs and does not reach its unit; the reason follows.
+#: Text about a driver that runs but does not reach its drive unit; the reason follows.
 LINK_LOST = "; the driver does not reach the electronics: "
 
 
@@ -43,12 +43,12 @@ class Finding(NamedTuple):
     note: bool = False
 
 
-#: A name and what finds out; None when all is well.
+#: Name of a check, and its function, which returns None when all is well.
 Check = tuple[str, Callable[[], Finding | None]]
 
 
 def machine_checks(namespace: str = "") -> list[Check]:
-    """All of them, in the order in which a cure makes sense."""
+    """All checks of a machine, in the order in which cures make sense."""
     return [
         ("packages", packages),
         ("Fast DDS profile", profile),
@@ -142,7 +142,7 @@ def messages() -> Finding | None:
 
 
 def running_nodes(namespace: str = "") -> Finding:
-    """Nodes of the suite in this domain: twice is wrong, none is worth knowing; and how their clock differs."""
+    """Running nodes of the suite: twice is wrong, none is a note, and a clock that differs from ours is wrong."""
     from dm_client import DeformableMirrorClient
     from dm_tools.running_suite import BUSY_S, NEEDED, nodes_of_suite, where
 
@@ -179,7 +179,7 @@ def running_nodes(namespace: str = "") -> Finding:
 
 
 def _skew(client: Any) -> Finding | None:
-    """How far the clocks of the machines that the nodes run on are from ours; every node reports once a second."""
+    """Check how far the clocks of the nodes' machines are from ours; every node reports once a second."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     from dm_common.messages import seconds
@@ -219,7 +219,7 @@ def disk(path: Path) -> Finding | None:
 
 
 def disk_use() -> Finding:
-    """What is free, and what the suite's own folders take."""
+    """Free disk space, and the space that the suite's own folders take."""
     home = Path.home()
     if scarce := disk(home):
         return scarce
@@ -232,7 +232,7 @@ def disk_use() -> Finding:
 
 
 def clock() -> Finding | None:
-    # This file cannot be younger than now.
+    # A clock that is earlier than the installation of this file is wrong.
     installed = Path(__file__).stat().st_mtime
     if time.time() < installed:
         return Finding(

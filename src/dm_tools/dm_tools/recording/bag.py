@@ -22,14 +22,14 @@ except ModuleNotFoundError as error:  # rosdep has no key for it
     raise RuntimeError("recordings need rosbags: `pip install rosbags`, see docs/install.md") from error
 
 METADATA_FILE, SUFFIX = "metadata.yaml", ".mcap"
-#: What an MCAP file begins with, and ends with when it was finished.
+#: First bytes of an MCAP file, and its last bytes if it was finished.
 MAGIC = b"\x89MCAP0\r\n"
-#: Topic that tells the parameters of nodes.
+#: Topic on which nodes publish their parameters.
 PARAMETER_EVENTS = "/parameter_events"
-#: What was recorded reaches the disk with the first message that is so much later, ns, or by `BagWriter.flush`; the
+#: Recorded messages reach the disk with the first message that is later than this, ns, or by `BagWriter.flush`; the
 #: rest is lost when the recorder is killed or loses its power.
 FLUSH_NS = 4 * 10**9
-#: The library writes no checksums of its own; those of zstd are checked by whoever decompresses.
+#: The library writes no checksums of its own; those of zstd are verified by every decompressor.
 CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
 
 
@@ -126,11 +126,11 @@ class BagReader:
         topics, counts: topics, and numbers of their messages, by name.
         messages: of all topics.
         duration_s: from the first message to the last.
-        unfinished: files that have no end (the recorder was killed); what is whole in them is read.
+        unfinished: files without an end (the recorder was killed); their complete records are read.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open what is at `path`. Raises BagError when that is no recording, or none that can be read."""
+        """Open what is at `path`. Raises BagError when it is not a recording, or cannot be read."""
         self.path = path
         self.topics: dict[str, Topic] = {}
         with self._opened() as readers:
@@ -155,12 +155,12 @@ class BagReader:
                 for connection, time, data in reader.messages(chosen) if chosen else ():
                     yield Message(self.topics[connection.topic], data, time)
                     missing -= 1
-            if missing:  # for no checksum guards the index by which messages are found
+            if missing:  # no checksum protects the index by which messages are found
                 raise ValueError(f"{missing} messages are missing")
 
     @contextmanager
     def _opened(self) -> Iterator[list[Reader]]:
-        """What the recording consists of, open, in order; what goes wrong while it is read becomes BagError."""
+        """Open the files of the recording, in order of time; any failure while they are read becomes BagError."""
         try:
             with ExitStack() as stack:
                 readers = [stack.enter_context(_reader(path)) for path in _parts(self.path)]
@@ -170,12 +170,12 @@ class BagReader:
 
 
 class _Unfinished(McapReader):
-    """An MCAP file whose recorder was killed: what is whole in it."""
+    """An MCAP file whose recorder was killed; its complete records are read."""
 
     messages = McapReader.messages_scan  # there is no index
 
     def open(self) -> None:
-        """Find the whole records and what is in them."""
+        """Find the complete records and their contents."""
         self.bio, size = self.path.open("rb"), self.path.stat().st_size
         self.data_start = end = len(MAGIC)
         while end <= size:
@@ -192,7 +192,7 @@ class _Unfinished(McapReader):
 
 
 def _reader(path: Path) -> Reader:
-    """Of a folder with metadata, or of a file."""
+    """Reader of a folder with metadata, or of a file."""
     reader = Reader(path)
     if path.is_file() and path.suffix == SUFFIX:
         with path.open("rb") as content:
@@ -206,12 +206,12 @@ def _reader(path: Path) -> Reader:
 
 
 def _stored(reader: Reader) -> list[interfaces.Connection]:
-    """The topics as the files tell them; a folder's metadata may tell another quality of service, or number."""
+    """The topics by the files themselves; a folder's metadata may give another quality of service, or count."""
     return [each for file in getattr(reader.storage, "storages", [reader.storage]) for each in file.connections]
 
 
 def _parts(path: Path) -> list[Path]:
-    """The folder, if it has metadata, or the files. A file that has a folder to itself is as good as that folder."""
+    """The folder, if it has metadata, or else the files. A file that is alone in its folder counts as that folder."""
     if path.is_file():
         alone = len(list(path.parent.glob(f"*{path.suffix}"))) == 1
         return [path.parent if alone and path.with_name(METADATA_FILE).is_file() else path]
@@ -224,7 +224,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 def offered(profile: Any) -> interfaces.Qos:
-    """What a publisher offers, a `QoSProfile`, as it is recorded."""
+    """Convert the `QoSProfile` that a publisher offers to the form in which it is recorded."""
 
     def seconds(duration: Any) -> interfaces.QosTime:
         return interfaces.QosTime(*divmod(int(duration.nanoseconds), 10**9))

@@ -1,4 +1,4 @@
-"""Message types by name: their Python class, and their definition as text for whoever reads a recording without them.
+"""Message types by name: their Python class, and their definition as text for readers that lack these types.
 
 The text is rosbag2's: the definition, then each type it uses under a line of `=` and a line `MSG: package/Type`.
 """

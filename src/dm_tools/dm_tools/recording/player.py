@@ -14,7 +14,7 @@ from dm_tools.recording.recorder import COMMON
 
 #: Topics that would move a real mirror; published only when asked for.
 COMMANDS = ("actuator_command", "focus_request")
-#: What the driver alone says: nodes that follow a living one would take moves of the recording for its own.
+#: Topic that only drivers publish: nodes that follow a live driver would take the recorded moves for its own.
 DRIVER_STATE = "actuator_state"
 #: Topics that belong to the nodes of the recording, not to its data.
 HOUSEKEEPING = ("/rosout", PARAMETER_EVENTS)
@@ -58,8 +58,8 @@ def play(
 ) -> dict[str, int]:
     """Publish the topics `names` of the recording; returns the number of messages of each that was published.
 
-    Left out are topics whose type is not installed, or had another layout when they were recorded: its bytes would be
-    read as nonsense.
+    Topics are left out whose type is not installed, or had another layout when they were recorded: their bytes would
+    be misread.
 
     Args:
         rate: times faster than recorded, above 0.
@@ -67,7 +67,7 @@ def play(
         remark: called with a sentence for each topic that is left out.
 
     Raises:
-        ValueError: the state of a driver where one runs.
+        ValueError: one of the topics is the state of a driver, and a driver is running.
         BagError: the file is damaged.
     """
     with closing(Connection("dm_player", "", domain, topics={}, watched={})) as connection:
@@ -95,13 +95,13 @@ def play(
             publishers[message.topic.name].publish(message.data)
             counts[message.topic.name] += 1
             progress(elapsed)
-        for publisher in publishers.values():  # or the last messages would leave with their publisher
+        for publisher in publishers.values():  # otherwise the last messages would be lost with their publisher
             publisher.wait_for_all_acked()
         return counts
 
 
 def _check_no_driver(node: Node, name: str) -> None:
-    """Raise ValueError where the topic is the state of a driver, and one publishes it."""
+    """Raise ValueError if the topic is the state of a driver, and a live driver publishes it."""
     if name.rsplit("/", 1)[-1] != DRIVER_STATE:
         return
     if living := {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}:
@@ -112,7 +112,7 @@ def _check_no_driver(node: Node, name: str) -> None:
 
 
 def _has_changed(node: Node, topic: Topic) -> bool:
-    """Whether its type has another layout than was recorded, as far as is known."""
+    """Whether the type of `topic` has another layout than was recorded, as far as is known."""
     published = [info for info in node.get_publishers_info_by_topic(topic.name) if info.node_name == node.get_name()]
     return topic.type_hash.startswith("RIHS") and topic.type_hash not in {str(o.topic_type_hash) for o in published}
 

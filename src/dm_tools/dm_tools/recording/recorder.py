@@ -28,15 +28,15 @@ from dm_tools.recording.interfaces import UnknownTypeError, definition, message_
 
 #: How often new topics are looked for, s.
 DISCOVERY_PERIOD_S = 0.25
-#: A node that has just started may miss a question, or its answer be missed: it is asked again after so long, s.
+#: A node is asked for its parameters again after this time, s: just after a start, request or answer may be lost.
 ASK_AGAIN_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
 #: Longest sleep of the executor, s; only bounds how soon it ends.
 SPIN_S = 0.1
-#: After so long without a message the writer flushes, s; with `FLUSH_NS` nothing waits longer than five seconds.
+#: The writer flushes after this time without a message, s; with `FLUSH_NS` no message waits longer than five seconds.
 IDLE_S = 1.0
-#: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
+#: Topic of the maps themselves, several megabytes each; the results of their fits are on other topics.
 MAP_TOPIC = "surface_map"
 
 #: Topics that all mirrors of a domain share.
@@ -44,7 +44,7 @@ COMMON = ("/diagnostics", "/rosout", "/clock", "/tf", "/tf_static", PARAMETER_EV
 
 
 class Recorder:
-    """Records until it is left: use it as a context manager.
+    """Records from its creation until the end of its `with` block.
 
     Args:
         folder: of the new recording.
@@ -80,12 +80,12 @@ class Recorder:
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
         self._subscribed: set[str] = set()
         self._clients: dict[str, AsyncParameterClient] = {}
-        # By what publishes a node's parameter events: when it is asked again, and when it was first seen, ns.
+        # By publisher of a node's parameter events: when to ask it again (monotonic, s); when it was first seen, ns.
         self._asked: dict[bytes, float] = {}
         self._seen: dict[bytes, int] = {}
         self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
-        # The events executor cannot hand over messages as they came (it fails on raw subscriptions).
+        # The events executor cannot pass on serialised messages (it fails on raw subscriptions).
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._spinning = threading.Thread(target=self._spin, name="recorder", daemon=True)
@@ -129,7 +129,7 @@ class Recorder:
         try:
             while not self._stopping:
                 self._executor.spin_once(SPIN_S)
-        except Exception as error:  # or the recording would go on without a word and without messages
+        except Exception as error:  # otherwise the recording would silently continue without messages
             self._failure = error
 
     def _discover(self) -> None:
@@ -150,7 +150,7 @@ class Recorder:
     def _subscribe(self, name: str, type_name: str) -> None:
         publishers = self._node.get_publishers_info_by_topic(name)
         if not publishers:
-            return  # nobody says what it is like yet
+            return  # its type and quality of service are not known yet
         self._subscribed.add(name)
         profiles = [publisher.qos_profile for publisher in publishers]
         topic = Topic(name, type_name, [offered(profile) for profile in profiles], str(publishers[0].topic_type_hash))
@@ -166,7 +166,7 @@ class Recorder:
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
     def _ask_parameters(self) -> None:
-        """Ask nodes of the suite for their parameters, once each, and each that is started anew; answers come later."""
+        """Ask each node of the suite for its parameters, once after every start of it; the answers come later."""
         if PARAMETER_EVENTS not in self._subscribed:
             return
         now = time.monotonic()
@@ -188,7 +188,7 @@ class Recorder:
         """Fetch the values of the names listed; they are recorded as if the node began now."""
         client, names = self._clients[path], listed.result().result.names
 
-        # Where one of those asked for has no value any more, rclpy answers with none at all: it is asked again.
+        # If one of the parameters asked for has no value any more, rclpy returns no values at all: it is asked again.
         def fetch(answer: Any) -> None:
             if len(types := answer.result().types) == len(names):
                 typed = zip(names, types, strict=True)
@@ -200,7 +200,7 @@ class Recorder:
                 return
             given = [Parameter(name=name, value=value) for name, value in zip(known, values, strict=True)]
             event = serialize_message(ParameterEvent(node=path, new_parameters=given))
-            # What changes from when it was seen is told later, so the newer value stands.
+            # Stamped with the time of its discovery: later changes are recorded after it and replace its values.
             self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, event, self._seen[node]))
             self._asked[node] = math.inf
 
@@ -220,12 +220,12 @@ class Recorder:
             if self._failure is None:
                 try:
                     job()
-                except Exception as error:  # the library raises plain ones and asserts; nobody would see the thread end
+                except Exception as error:  # of any kind, also asserts: the end of the thread would go unnoticed
                     self._failure = error
 
 
 def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """What to ask for, so that all publishers match and latched messages arrive where all are latched."""
+    """Quality of service that matches all publishers, and receives latched messages if all of them are latched."""
     reliable = all(profile.reliability is ReliabilityPolicy.RELIABLE for profile in offered)
     latched = all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
     return QoSProfile(

@@ -1,4 +1,4 @@
-"""What a recording says of a calibration run, and the calibration made again from it."""
+"""A calibration run as read from a recording, and the calibration made again from it."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ TOPICS = ("mirror_info", "actuator_state", "zernike", "surface_samples", "surfac
 
 
 def _arrays(kind: Any) -> list[str]:
-    """The fields of a message that hold numbers of any count."""
+    """The fields of a message that are arrays of numbers of any length."""
     return [name for name, type_name in kind.get_fields_and_field_types().items() if type_name == "sequence<double>"]
 
 
@@ -96,7 +96,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     before = [message for time, message in received["calibration"] if time < begun and message.id]
     run = RecordedRun(mirror, tuple(moves), maps, first.feedback.plan, _model(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", begun)
-    stamps = {measured.stamp_ns for measured in maps}  # also of maps taken since the run
+    stamps = {measured.stamp_ns for measured in maps}  # including maps taken after the run
     known = {message.id for message in before}
     made = [each for each in during["calibration"] if each.id not in known and stamp_ns(each.header.stamp) in stamps]
     return Session(run, parameters, made[0] if made else None, remarks)
@@ -107,7 +107,7 @@ def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibrati
 
     Raises:
         RecordingError: the recording does not hold the whole run.
-        TooFewMapsError, ValueError: as live.
+        TooFewMapsError, ValueError: as in a live calibration.
     """
     values, run = session.parameters, session.run
     _plan, outcome = repeat_run(run, procedure_options(values))
@@ -145,7 +145,7 @@ def _runs(messages: Iterable[tuple[int, Any]]) -> list[list[tuple[int, Any]]]:
 
 
 def _moves(states: Iterable[tuple[int, Any]], mirror: Mirror) -> Iterator[tuple[int, Move]]:
-    """The moves that ended, with the time received; each is in the first message that counts one turn more."""
+    """The moves that ended, with the time received; each is in the first message in which `turns` has changed."""
     turns: int | None = None
     degausses = 0
     for time, state in states:
@@ -168,7 +168,7 @@ def _maps(messages: dict[str, list[Any]]) -> tuple[Measurement, ...]:
 
 
 def _model(calibration: Any) -> Any:
-    """What a shape is solved from, of the message of a calibration that was in use: a `LinearModel`."""
+    """The `LinearModel` from which shapes are solved, from the message of the calibration that was in use."""
     model = model_of(calibration)
     return SimpleNamespace(influence_sag=model.influence_sag, sag_offset=model.sag_offset, points=points_of(model))
 
@@ -177,7 +177,7 @@ def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], 
     """Parameters of `node` when the run began, and what is not known of them."""
     defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
     told: dict[str, Any] = {}
-    # The recorder writes answers later than their time; only a file that was finished is read by time.
+    # The recorder writes answers later than their stamps; only a finished file is read in order of time.
     for message in sorted(bag.read([PARAMETER_EVENTS]), key=lambda each: each.log_time):
         event, before = _decode(message), message.log_time < begun
         if event.node == node:

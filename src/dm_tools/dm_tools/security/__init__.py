@@ -1,1 +1,1 @@
-"""The hardened profile: what each node may say and hear, as SROS 2 policies, and whether a keystore keeps to it."""
+"""The hardened profile: SROS 2 policies for each node, and the check that a keystore conforms to them."""

@@ -1,14 +1,14 @@
 """What every node of the suite publishes, subscribes to, offers and calls: the one source of all policies.
 
-`tests/repository/test_security_profile.py` starts the nodes and compares this table with their ROS graph: nothing may
-be missing, and nothing may stand here that no node uses.
+`tests/repository/test_security_profile.py` starts the nodes and compares this table with their ROS graph: no interface
+may be missing, and none may be listed that no node uses.
 """
 
 from dataclasses import dataclass, replace
 
 from dm_bringup.nodes import NODES
 
-#: Of every node.
+#: Services of every node.
 PARAMETER_SERVICES = (
     "~/describe_parameters",
     "~/get_parameter_types",
@@ -26,10 +26,10 @@ LIFECYCLE_SERVICES = (
     "~/get_transition_graph",
 )
 LOGS = ("/parameter_events", "/rosout")
-#: Whoever may publish it turns the time of all others.
+#: Whoever may publish on this topic controls the time of all others.
 CLOCK = "/clock"
 HEALTH = "/diagnostics"
-#: What an operator's program hears and calls.
+#: What an operator's program subscribes to and calls.
 _HEARD = (HEALTH, "actuator_state", "calibration", "capabilities", "mirror_info", "recipes")
 _MAPS = ("surface_map", "surface_map_info")
 _OPERATION = ("flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
@@ -41,7 +41,7 @@ class NodeInterface:
     """One node's interfaces. Names are relative to the mirror's namespace, `~` is the node, `/` begins a global name.
 
     Attributes:
-        name: of the node; `*` where the process number stands.
+        name: of the node; `*` in place of the process number.
         publish, subscribe: topics.
         reply, request: services that the node offers and calls.
         execute, call: actions that it offers and calls.
@@ -85,7 +85,7 @@ _DECLARED = (
         execute=("calibrate",),
         call=("degauss",),
     ),
-    # The way back to mid range when the node ends in a run: the same process, over a node of its own.
+    # Sends the mirror to mid range when the node ends during a run: the same process, with a node of its own.
     NodeInterface("calibration_exit", request=("set_signals",), enclave="calibration"),
     NodeInterface(
         "focus_controller",

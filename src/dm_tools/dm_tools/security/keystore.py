@@ -1,4 +1,4 @@
-"""Whether a keystore keeps to the profile: its policies, its permissions, and who may read its private keys."""
+"""Check that a keystore conforms to the profile: its policies, its permissions, and who may read its private keys."""
 
 import stat
 from datetime import UTC, datetime
@@ -20,7 +20,7 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
         found += _compare_text(profile.policy(folder, enclave), policy_xml(profile, enclave))
     governance = folder / "enclaves" / "governance.xml"
     found += _compare_text(governance, governance_xml(profile))
-    # Nodes go by what was signed, which sros2 does once with the keystore; enclaves have links to it.
+    # Nodes use the signed file, which sros2 signs once, together with the keystore; enclaves have links to it.
     for signed in sorted({path.resolve() for path in governance.parent.rglob("governance.p7s")}):
         if signed.is_file() and governance.is_file() and _plain(governance) not in _plain(signed):
             cure = "remove it, and create_keystore signs it anew"
@@ -33,7 +33,7 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
         place = path.parent.relative_to(folder / "enclaves").as_posix()
         if place in expected:
             found += _check_permissions(path, profile, place.rsplit("/", 1)[-1])
-        elif place.rpartition("/")[0] == profile.path("").strip("/"):  # others are of other mirrors
+        elif place.rpartition("/")[0] == profile.path("").strip("/"):  # other enclaves belong to other mirrors
             found.append(f"{path}: an enclave that no node of this profile has")
     for path in sorted(folder.rglob("*.pem")):
         if path.name.endswith("key.pem") and path.stat().st_mode & _OTHERS:

@@ -9,7 +9,7 @@ from dm_tools.security.interfaces import NodeInterface, interfaces
 
 #: Version of the policy format (sros2, policy.xsd).
 POLICY_VERSION = "0.2.0"
-#: Enclaves of the suite stand under this one.
+#: Parent of the suite's enclaves.
 ROOT = "/dm"
 _RULES = {"topic": ("publish", "subscribe"), "service": ("reply", "request"), "action": ("execute", "call")}
 _ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
@@ -71,11 +71,11 @@ class Profile:
         return f"{ROOT}{self.ns.rstrip('/')}/{enclave}"
 
     def folder(self, keystore: Path) -> Path:
-        """What the keystore has of this mirror alone, but for its enclaves."""
+        """Folder in the keystore with the files of this mirror alone, except for its enclaves."""
         return keystore / self.ns.strip("/")
 
     def policy(self, keystore: Path, enclave: str) -> Path:
-        """Where the policy of an enclave lies."""
+        """Path of the policy file of an enclave."""
         return self.folder(keystore / "policies") / f"{enclave}.policy.xml"
 
     def enclaves(self) -> dict[str, list[NodeInterface]]:
@@ -87,7 +87,7 @@ class Profile:
 
 
 def full_name(name: str, ns: str, node: str) -> str:
-    """A name as it stands in the ROS graph."""
+    """A name as it appears in the ROS graph."""
     prefix = ns.rstrip("/")
     if name.startswith("~"):
         return f"{prefix}/{node}{name[1:]}"
@@ -112,7 +112,7 @@ def policy_xml(profile: Profile, enclave: str) -> str:
 
 
 def governance_xml(profile: Profile) -> str:
-    """Who may join the domain and how: authenticated participants only, access control, everything encrypted."""
+    """The governance file of the domain: authenticated participants only, access control, everything encrypted."""
     return GOVERNANCE.format(domain=profile.domain, schema=GOVERNANCE_SCHEMA)
 
 
@@ -137,7 +137,7 @@ def dds_topics(profile: Profile, enclave: str) -> dict[str, set[str]]:
 
 
 def environment(profile: Profile, keystore: Path) -> str:
-    """A shell script that makes the keys with sros2, and what to set for each process."""
+    """A shell script that sets the environment of every process; as comments, how to make the keys with sros2."""
     store = shlex.quote(str(keystore))
     lines = [
         "# Sourced by whoever starts the nodes. Without the keys nothing starts: that is what Enforce means.",
@@ -165,7 +165,7 @@ def environment(profile: Profile, keystore: Path) -> str:
 def write_profile(profile: Profile, folder: Path) -> list[Path]:
     """Write policies, governance and environment into a keystore's folder; returns the files. Raises OSError.
 
-    What others have there, of mirrors in other namespaces, stays; the governance is of all.
+    Files of mirrors in other namespaces are left alone; the governance is common to all.
     """
     folder = folder.absolute()
     files = {profile.policy(folder, enclave): policy_xml(profile, enclave) for enclave in profile.enclaves()}

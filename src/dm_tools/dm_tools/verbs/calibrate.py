@@ -26,9 +26,9 @@ from dm_tools.output import (
 from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
 from dm_tools.running_suite import REPORT_S, naming_holder, nodes_of_suite, promise, promise_of, running_suite
 
-#: What tells the sentence of a result on what --until asked for.
+#: Matches the sentence of a result that says whether the accuracy of --until was reached.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
-#: What --boresight goes by unless told otherwise.
+#: Default region and topic of --boresight.
 REGION, IMAGE_TOPIC = "0.25,0.25,0.5,0.5", "image_raw"
 
 
@@ -74,7 +74,7 @@ def run_calibration(client: Any, goal: Any) -> Any:
 
 
 def expected_run(client: Any, goal: Any) -> str:
-    """How long the whole run of a Calibrate goal takes and how good it will be; nothing moves."""
+    """Expected duration and accuracy of the whole run of a Calibrate goal; nothing moves."""
     question = copy(goal)
     question.dry_run = True
     return str(client.calibrate(question).message).removesuffix("; nothing was moved")
@@ -132,13 +132,13 @@ def show_result(result: Any, calibration: Any = None) -> None:
 
 def after_run(result: Any, written: Path | None) -> str:
     """What to do next, with the parameters that were found `written` to a file or not; "" = nothing to advise."""
-    if result.parameters:  # with them limits count for the true neighbours, and the aperture is where the mirror is
+    if result.parameters:  # they correct which actuators are neighbours for the limits, and where the aperture is
         return f"start the nodes with {written or 'these parameters'}, and calibrate again"
     return "./dm focus 0.02" if result.id else "./dm calibrate" if result.poke_check_passed else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:
-    """A calibration's figures for JSON; NaN for what it does not have, as a dry run has no residual."""
+    """A calibration's figures for JSON; NaN for those that it lacks, such as the residual of a dry run."""
     residuals = figures(result, "in_sample_rms_nm", "held_out_rms_nm")
     of_moves = figures(result, "hysteresis_held_out_max_zernike_nm", "expected_max_zernike_nm")
     return (
@@ -258,13 +258,13 @@ def calibrate(
                 console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
-            nodes = nodes_of_suite(client) if source is not None else ()  # now: at first not all are heard
+            nodes = nodes_of_suite(client) if source is not None else ()  # only now: at first not all are heard
         except BaseException as error:
             if (response := getattr(error, "response", None)) is not None:
                 show_result(response)
                 if write is not None and source is not None and response.poke_findings:
                     write_parameters(response.parameters, write, source, namespace, nodes_of_suite(client))
-            if fresh:  # refused or interrupted before it began, it would hold for somebody else's goal
+            if fresh:  # if the run did not begin, the parameter would still be set for somebody else's goal
                 with suppress(DeformableMirrorError):
                     set_parameter(client, "calibration", "start_fresh", False)
             raise

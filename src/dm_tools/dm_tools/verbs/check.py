@@ -29,7 +29,7 @@ from dm_tools.running_suite import (
     verdict,
 )
 
-#: From so much on it is said that an error is predicted, m.
+#: A predicted error is mentioned from this size on, m.
 MENTIONED = 0.5e-9
 
 
@@ -60,14 +60,14 @@ def check(
         health = hear_health(client)
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
-        # What the shape that stands was promised, and not what the calibration promises of any; of that what is beyond
-        # its prediction, which the map is compared with.
+        # The bound of the present shape, not the one that the calibration promises for any shape. Its predicted part
+        # is subtracted, because the map is compared with the prediction.
         patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
         client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
     shape, capabilities = settled_shape(health), client.messages.get("capabilities")
-    # The map is compared by the history that the node `calibration` knows, which may have run for longer.
+    # The map is compared by the history known to the node `calibration`, which may have run for longer.
     lost = unknown_history(capabilities)
-    if lost or capabilities is None:  # what a focus controller would promise who knows as much
+    if lost or capabilities is None:  # the promise of a focus controller that knew as much as that node
         promised = promise_of(calibration)
     else:
         promised = shape.bound - shape.predicted if shape is not None else capabilities.error_bound

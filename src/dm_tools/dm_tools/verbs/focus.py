@@ -84,7 +84,7 @@ def _calibration(client: Any) -> Any:
 
 
 def _show(state: Any, calibration: Any) -> None:
-    """What a dm_msgs/FocusState promises, made with this dm_msgs/Calibration, None = not known."""
+    """Print what a dm_msgs/FocusState promises, made with this dm_msgs/Calibration, None = not known."""
     console.print(
         f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
         f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient; "

@@ -50,7 +50,7 @@ def instrument(
 
     def read(path: Path) -> Any:
         surface = read_map(path, xyz_unit=xyz_unit or None)
-        if not surface.wavelength:  # the file does not tell it
+        if not surface.wavelength:  # it is not in the file
             return surface
         try:
             return replace(surface, sag=mend_phase_steps(surface.sag, 0.5 * surface.wavelength)[0])
@@ -113,7 +113,7 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
             "the flats, or turn one by an angle of no simple share of a turn",
             soft_wrap=True,
         )
-    # The bound is one on coefficients up to this order, which hold nothing of the orders beyond.
+    # The bound is on coefficients up to this angular order, to which higher orders contribute nothing.
     known = not any(order <= MAX_ORDER for order in found.open_orders) and math.isfinite(found.bound)
     return {"reference_surface": str(target.absolute())} | ({"instrument_error": found.bound} if known else {})
 
@@ -153,10 +153,10 @@ def _grid(table: Path, surface: Any) -> dict[str, Any]:
 
 
 def _table(path: Path, *names: str) -> list[list[str]]:
-    """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then.
+    """The rows of a CSV file with these headings, in any order; a missing column `degrees` means 0.
 
     Raises:
-        ValueError: naming the file, and the row that lacks a value or holds what is no number.
+        ValueError: naming the file, and the row that lacks a value or holds something other than a number.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading

@@ -61,7 +61,7 @@ def measure(
 
 
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:
-    """Say what lateral resolution (m per pixel) a map of a known sphere shows, as parameters, and what limits it."""
+    """Print the lateral resolution (m per pixel) that a map of a known sphere gives, as parameters, and its limits."""
     from dm_calibration.influence.poke_cure import parameter_text
     from dm_common.optics.conic import pitch_of_sphere
 

@@ -11,7 +11,7 @@ import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, NotRunningError, console, write_json
 
-#: How often the count on the screen is renewed, s.
+#: Period at which the count on the screen is updated, s.
 SHOWN_EVERY_S = 0.5
 
 
@@ -32,7 +32,7 @@ def record(
     from dm_tools.recording.bag import PARAMETER_EVENTS
     from dm_tools.recording.recorder import COMMON, Recorder
 
-    # SIGTERM must finish the file as Ctrl-C does, which a shell lets commands in the background ignore.
+    # SIGTERM must finish the file as Ctrl-C does; set both: shells start background commands with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     folder = out if out is not None else Path("runs") / time.strftime("recording-%Y%m%dT%H%M%S")
@@ -57,7 +57,7 @@ def record(
     for name in recorder.unseen:
         console.print(f"[yellow]not recorded[/] {name}: nobody published it")
     console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
-    of_others = (PARAMETER_EVENTS,) if names else COMMON  # what all share is recorded in a namespace of nobody, too
+    of_others = (PARAMETER_EVENTS,) if names else COMMON  # shared topics are recorded in an unused namespace too
     if not any(count for name, count in counts.items() if name not in of_others):
         shutil.rmtree(folder)
         if names and counts.get(PARAMETER_EVENTS):  # nodes of the suite have answered

@@ -13,14 +13,14 @@ import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
 
-#: Where the node `calibration` keeps its files: of the shipped virtual bench, and unless told otherwise.
+#: Stores of the node `calibration`: that of the shipped virtual bench, and the default.
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 
 
 def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], str]:
-    """File of the calibration that the running suite uses, what a report is judged by there, and of which mirror.
+    """Calibration file of the running suite, the parameters by which it judges a report, and its mirror's serial.
 
-    No file: it has none, or runs elsewhere. The parameters as they are by default: nothing runs.
+    The file is None when there is none or the suite runs elsewhere; parameters are the defaults when nothing runs.
     """
     from dm_calibration.calibration_parameters import JUDGED_BY
     from dm_client import DeformableMirrorClient, DeformableMirrorError
@@ -113,7 +113,7 @@ def report(
             raise ValueError(f"no calibration in {folders}: calibrate first (./dm calibrate), or name its --store")
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:
-        values = JUDGED_BY  # another mirror's limits are none of this one
+        values = JUDGED_BY  # the parameters of the running suite are another mirror's
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
     if console.is_terminal and sys.stdin.isatty():
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):

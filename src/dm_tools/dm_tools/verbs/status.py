@@ -24,7 +24,7 @@ from dm_tools.running_suite import (
     where,
 )
 
-#: A node that is not found after this does not run, s: it announces itself every second, which a busy machine may miss.
+#: A node not found within this time is not running, s: each announces itself every second; a busy machine may miss it.
 MISSING_S = 10.0
 
 
@@ -71,7 +71,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
 
 
 def _health(health: dict[str, Any]) -> str:
-    """What nodes say of themselves unless all is well, each sentence once."""
+    """Health messages of the nodes that are not well, each sentence once."""
     said: dict[str, list[str]] = {}
     for name, each in health.items():
         if each.level != b"\0":
@@ -95,7 +95,7 @@ def _now(by: str, shape: SettledShape | None, state: Any) -> str:
 
 
 def _calibration(calibration: Any, now: float = 0.0) -> str:
-    """The calibration in a line; its age at `now`, s of the time of the bench, which may have one of its own."""
+    """The calibration in one line; its age at `now`, s in the time of the bench, which may not be the wall clock."""
     if calibration is None or not calibration.id:
         return "not heard" if calibration is None else "none in use"
     age = now - calibration.header.stamp.sec
@@ -112,7 +112,7 @@ def _promise(capabilities: Any) -> str:
         return "not known: focus_controller is not heard"
     if capabilities.error_code:
         return f"none now: {capabilities.message}"
-    remarks = capabilities.message.partition("; ")[2]  # behind the range
+    remarks = capabilities.message.partition("; ")[2]  # the part after the range
     return (
         f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
         f"from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move says its own"
@@ -124,7 +124,7 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
     if capabilities is None or calibration is None or capabilities.error_code:
         return "not known"
     farthest = max(capabilities.curvature_min, capabilities.curvature_max, key=abs)
-    farthest = math.trunc(1e4 * farthest) / 1e4  # as the range is told
+    farthest = math.trunc(1e4 * farthest) / 1e4  # as the range is printed
     known = min(calibration.instrument_error, calibration.scale_error) > 0.0
     return two_fold(capabilities.error_bound, calibration, farthest) + (f", at {farthest:+.4f} 1/m" if known else "")
 

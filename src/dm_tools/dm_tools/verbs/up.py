@@ -19,15 +19,15 @@ from dm_bringup.suite import Config, load_config
 from dm_tools.output import checked_namespace, console, next_step
 from dm_tools.running_suite import calibration_refused, unknown_history
 
-#: A suite that is not ready after this is said to be late, s.
+#: A suite that is not ready after this time is reported as late, s.
 LATE_S = 30.0
-#: How a line of a node's log looks, unless the user has chosen: with the time of the wall clock.
+#: Format of the lines of a node's log, unless the user has set one: with the time of the wall clock.
 LOG_FORMAT = "{date_time_with_ms} {severity} {name}: {message}"
-#: Between the ports of two virtual benches.
+#: Distance between the port numbers of two virtual benches.
 PORTS_APART = 10
 
-#: Of the virtual camera: objects from left to right [m]; what is in focus while the mirror is flat [m], so that
-#: +-0.05 1/m reach from 5 m to infinity; images per second.
+#: Of the virtual camera: distances of the objects from left to right [m]; distance in focus with the flat mirror [m],
+#: so that +-0.05 1/m reach from 5 m to infinity; images per second.
 DISTANCES = (6.0, 15.0, 100.0)
 REST_DISTANCE = 10.0
 RATE = 30.0
@@ -90,10 +90,10 @@ def up(
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
         for name, configuration in mirrors.items():
             stack.enter_context(only_suite(name))
-            # Else a driver would take the mirror of another bench for its own.
+            # Otherwise a driver would take the mirror of another bench for its own.
             if taken := taken_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
                 raise RuntimeError(f"virtual_bench: {taken.problem}: {taken.cure}")
-        # Closed last of all: the mirrors are safe first.
+        # Closed after the suites, which make the mirrors safe first.
         watches = [
             stack.enter_context(contextlib.closing(say_when_ready(name, file)))
             for name, file in itertools.zip_longest(mirrors, config or [])
@@ -121,7 +121,7 @@ def up(
 
 @contextlib.contextmanager
 def only_suite(namespace: str) -> Iterator[None]:
-    """Keep the place of the suite in this ROS domain and namespace. Raises RuntimeError when another does."""
+    """Lock this ROS domain and namespace for one suite. Raises RuntimeError when another suite has the lock."""
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     folder = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
@@ -142,7 +142,7 @@ def only_suite(namespace: str) -> Iterator[None]:
 
 
 def lacks(messages: Mapping[str, Any]) -> str:
-    """What keeps a suite that said `messages` (by topic) last from taking requests; "" = nothing."""
+    """Why a suite does not take requests yet, by its latest `messages` (by topic); "" = it takes them."""
     from dm_client.connection import RESTING
 
     state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
@@ -158,7 +158,7 @@ def lacks(messages: Mapping[str, Any]) -> str:
 
 
 def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, None]:
-    """Say when the suite of this namespace, configured by `file`, takes requests, and what to do next; yields till."""
+    """Yield until the suite of this namespace, configured by `file`, takes requests; say so and what to do next."""
     from dm_client import DeformableMirrorClient
 
     started, late = time.monotonic(), False
@@ -180,7 +180,7 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
 
 
 def first_command(capabilities: Any, file: Path | None) -> str:
-    """What to do first with a suite that `file` configures; None = the virtual bench that ships, whose wiring holds."""
+    """First command for a suite that `file` configures; None = the shipped virtual bench, whose wiring is correct."""
     if capabilities.calibration_id:
         return "degauss" if unknown_history(capabilities) else "focus 0.02"
     if calibration_refused(capabilities):
@@ -195,8 +195,8 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
 
     Raises:
         ConfigError: a file cannot be used.
-        ValueError: the numbers do not match, a namespace comes twice, a section is missing, mirrors share what each
-            needs for itself, or a file has the say on the camera.
+        ValueError: the numbers do not match, a namespace occurs twice, a section is missing, mirrors share a resource
+            that each needs for itself, or `camera` is given with a file, which decides that itself.
     """
     from dm_tools.doctor.bench import own_values
 
@@ -223,7 +223,7 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
 
 
 def check_apart(mirrors: Mapping[str, Config]) -> None:
-    """Raise ValueError where two mirrors have one unit, folder of maps, store of calibrations or port of a bench."""
+    """Raise ValueError if two mirrors share a drive unit, folder of maps, store of calibrations or port of a bench."""
     users: dict[tuple[str, Any], str] = {}
     for mirror, config in mirrors.items():
         for thing in _own(config):
@@ -233,7 +233,7 @@ def check_apart(mirrors: Mapping[str, Config]) -> None:
 
 
 def _own(config: Config) -> Iterator[tuple[str, Any]]:
-    """What no other mirror may have, with the names of the parameters."""
+    """Resources that no two mirrors may share, with the names of their parameters."""
     from dm_driver.electronics import BACK_ENDS
     from dm_tools.doctor.bench import BENCH_PORTS, effective, sound_values
 
@@ -264,7 +264,7 @@ def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
         simulation[key] += shift
     driver["electronics.port"] += shift
     simulation["seed"] += number
-    driver["mirror.serial"] = f"virtual-{name}-{simulation['seed']}"  # by another seed it is another mirror
+    driver["mirror.serial"] = f"virtual-{name}-{simulation['seed']}"  # another seed means another mirror
     folder = f"~/.ros/dm_bench/{name}"
     simulation["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
     own["calibration"]["calibration_folder"] = f"{folder}/calibrations"

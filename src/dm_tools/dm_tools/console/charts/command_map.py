@@ -16,13 +16,13 @@ from dm_tools.console.view_models import SIGNAL_COLOURS, Cell, ink_on
 
 #: Distance from the middle to a side of a lone actuator's cell, mm.
 ALONE = 2.0
-#: Free space below the map for the scale of the signals, px, as style.py has it for the height.
+#: Free space below the map for the scale of the signals, px; style.py adds the same to the height.
 SCALE = 44
 #: Colours of that scale, low to high; the browser blends them.
 SHADES = [to_hex(colour) for colour in colormaps[SIGNAL_COLOURS](np.linspace(0.0, 1.0, 33))]
 #: Points of the circle of the aperture.
 CIRCLE = 91
-#: Draws the cell of an actuator: its outline, and its number and signal as large as it has room for.
+#: JavaScript that draws an actuator's cell: its outline, and its number and signal as large as they fit.
 DRAW = """(params, api) => {
   const cell = %s[params.dataIndex], [x, y] = api.coord(cell.place), size = api.size([cell.size, 0])[0];
   const label = (content, dy, share, weight) => ({type: 'text', x, y: y + dy * size, style: {text: content,
@@ -35,11 +35,11 @@ DRAW = """(params, api) => {
 
 
 def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, low: float, high: float) -> Drawing:
-    """The cells where the actuators stand, with the scale of signals `low` .. `high`.
+    """Draw the actuators' cells at their positions, with the scale of signals `low` .. `high`.
 
     The third value of each datum is the actuator's number.
     """
-    # The outline of the chosen one must not be covered.
+    # The chosen actuator is drawn last: its outline must not be covered.
     in_order = sorted(cells, key=lambda cell: cell.number == chosen)
     shapes = outlines(tuple((cell.x, cell.y) for cell in in_order))
     reach = 1.01 * max([aperture_radius_mm, *(float(np.abs(corners).max()) for corners, _size in shapes)])
@@ -99,11 +99,11 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
 
 @lru_cache(maxsize=8)
 def outlines(places: tuple[tuple[float, float], ...]) -> list[tuple[NDArray[np.float64], float]]:
-    """For each actuator the corners (K, 2) of its cell in order, and how far the cell reaches to its nearest side.
+    """For each actuator the corners (K, 2) of its cell in order, and the distance from its centre to the nearest side.
 
-    Each is a regular hexagon that reaches half way to the nearest other actuator and has a side towards it, cut off
-    where another actuator is nearer: hexagons on a hexagonal grid, and never one over another elsewhere. In the unit
-    of `places`.
+    Each cell is a regular hexagon with one side facing the nearest other actuator, half way towards it. It is clipped
+    where another actuator is nearer. On a hexagonal grid the cells are whole hexagons; elsewhere they never overlap.
+    All lengths are in the unit of `places`.
     """
     points = np.array(places, dtype=np.float64).reshape(-1, 2)
     cells = []

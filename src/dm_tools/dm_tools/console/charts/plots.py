@@ -18,12 +18,12 @@ from dm_tools.console.view_models import Bar
 
 INK, FAINT = "#1f2933", "#c3ccd5"
 CROSS = "path://M-10,-2H-2V-10H2V-2H10V2H2V10H-2V2H-10Z"
-#: Safe for colour-blind readers, and readable in grey: for sag, and for differences about zero.
+#: Colour maps for sag and for differences about zero: safe for colour-blind readers, and readable in grey.
 SAG_COLOURS, DIFFERENCE_COLOURS = "viridis", "PuOr"
-#: Free space about the map, px: the bar stands on the right. As style.py has it for the height.
+#: Free space around the heat map, px; the colour bar is on the right. style.py uses the same for the height.
 LEFT, RIGHT, TOP, BOTTOM = 44, 62, 26, 40
 BAR_GAP, BAR_WIDTH = 10, 14
-#: Draws a picture from the corner (first two values of the datum) to the corner opposite (the other two).
+#: JavaScript that draws a picture between two opposite corners: the first two and the last two values of the datum.
 DRAW = """(params, api) => {
   const [x, y] = api.coord([api.value(0), api.value(1)]), [right, bottom] = api.coord([api.value(2), api.value(3)]);
   return {type: 'image', style: {image: '%s', x, y, width: right - x, height: bottom - y}};
@@ -43,13 +43,13 @@ class Drawing(NamedTuple):
 
 
 def chart(description: str, **options: Any) -> Drawing:
-    """A drawing whose marks give their names when the mouse is over them."""
+    """A drawing whose marks show their names when the mouse is over them."""
     hover = {"trigger": "item", "formatter": "{b}", "confine": True}
     return Drawing({"animation": False, "tooltip": hover, **options}, description)
 
 
 def axis(name: str, low: float | None = None, high: float | None = None, **more: Any) -> dict[str, Any]:
-    """A scaled axis from `low` to `high` (None = as the data need) with a line, ticks and its name beside it."""
+    """A scaled axis from `low` to `high` (None = as the data require) with a line, ticks and its name beside it."""
     return {
         "type": "value",
         "name": name,
@@ -65,9 +65,9 @@ def axis(name: str, low: float | None = None, high: float | None = None, **more:
 
 
 def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing:
-    """`surface` on a symmetric scale -limit .. +limit (m).
+    """Draw `surface` on a symmetric scale -limit .. +limit (m).
 
-    A picture, because ten thousand coloured fields would keep a browser busy whenever the mirror moves.
+    It is sent as one picture: ten thousand coloured cells would keep a browser busy whenever the mirror moves.
 
     Args:
         colours: name of a Matplotlib colour map.
@@ -80,7 +80,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
     share = np.linspace(0.0, 1.0, 33)
     stops = [{"offset": k, "color": to_hex(colormaps[colours](1.0 - k))} for k in share.tolist()]
     shades = {"type": "linear", "x": 0, "y": 0, "x2": 0, "y2": 1, "colorStops": stops}
-    # No numbers at the ends, which are not round.
+    # No labels at the ends of the axes, which are not round numbers.
     plain = {"splitLine": {"show": False}, "axisLabel": {"color": INK, "showMinLabel": False, "showMaxLabel": False}}
     frame = {"show": True, "borderColor": INK, "top": TOP, "bottom": BOTTOM}
     return chart(
@@ -110,7 +110,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
 
 
 def _image(values: NDArray[np.float64], colours: str) -> str:
-    """The values -1 .. +1 in colours, as the address of a picture; NaN is transparent."""
+    """The values -1 .. +1 in colours, as the data URL of a PNG picture; NaN is transparent."""
     rgba = colormaps[colours](np.clip(0.5 + 0.5 * np.nan_to_num(values), 0.0, 1.0), bytes=True)
     rgba[..., 3] = np.where(np.isfinite(values), 255, 0)
     buffer = io.BytesIO()
@@ -163,7 +163,7 @@ def residual_chart(residuals_nm: Sequence[float]) -> Drawing:
 
 
 def loop_chart(loop: Loop) -> Drawing:
-    """A hysteresis loop: modelled, measured, and where the actuator stands."""
+    """A hysteresis loop: modelled, measured, and the present state of the actuator."""
 
     def points(x: Sequence[float], y: Sequence[float]) -> list[list[float]]:
         return [[round(a, 5), round(b, 5)] for a, b in zip(x, y, strict=False)]

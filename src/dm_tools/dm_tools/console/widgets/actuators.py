@@ -87,7 +87,7 @@ class ActuatorCards:
     # --- moving ---
 
     def _typed_number(self, title: str) -> int | None:
-        """The number in the field, which need not be what is shown; None = of no actuator, and a failure says so."""
+        """Number in the field, which may differ from the one shown; None = no such actuator, reported as a failure."""
         if (value := self._number.value) in self._numbers:
             return int(value)
         shown = "" if value is None else f" = {value:g}"
@@ -95,7 +95,7 @@ class ActuatorCards:
         return None
 
     def _swing(self) -> float:
-        """The amplitude that was typed. Raises ValueError when there is none."""
+        """The amplitude in the field. Raises ValueError when it is not a number."""
         if (amplitude := self._amplitude.number) is None:
             raise ValueError("the amplitude must be a number")
         return amplitude
@@ -135,7 +135,7 @@ class ActuatorCards:
             return
         self._cells = cells(mirror, snapshot.actuator_state, snapshot.calibration)
         session.chosen = min(session.chosen, len(self._cells))
-        if session.chosen != self._followed:  # on another page
+        if session.chosen != self._followed:  # chosen on another page
             self._choose(session.chosen)
         radius = 0.5e3 * mirror.working_aperture_diameter
         self._picture.show(command_map(self._cells, session.chosen, radius, mirror.signal_min, mirror.signal_max))

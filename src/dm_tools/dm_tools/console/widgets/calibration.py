@@ -1,4 +1,4 @@
-"""The cards of calibrations (run one, see how it goes, load one) and of recipes (those there are, build more)."""
+"""The cards of calibrations (run, follow and load one) and of recipes (list and build them)."""
 
 from collections.abc import Iterable
 from html import escape
@@ -32,7 +32,7 @@ class CalibrationCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        #: What the list of the store depends on; None = it must be asked for.
+        #: Key of what the list of the store depends on; None = the list must be requested.
         self._listed: tuple[Any, ...] | None = None
         with card("Calibration"):
             self._text = ui.html("", sanitize=False).classes("text figures")
@@ -61,7 +61,7 @@ class CalibrationCard:
             )
 
     def _goal(self) -> Calibrate.Goal:
-        """What the fields ask for. Raises ValueError naming the field."""
+        """The goal from the fields. Raises ValueError naming the field."""
         goal = Calibrate.Goal(plan=str(self._plan.value), note=str(self._note.value or ""), activate=True)
         if goal.plan == Calibrate.Goal.PLAN_HYSTERESIS and self._maps.value is not None:
             length = float(self._maps.value)
@@ -93,7 +93,7 @@ class CalibrationCard:
         unchosen = "" if self._choice.value else "Choose a calibration first."
         self._load.allow(reason_against("store", snapshot, session.running) or unchosen)
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""
-        # Also after runs that were not started here, and after the node was started again.
+        # The list is also requested after runs that were started elsewhere, and after a restart of the node.
         key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.health)
         if key != self._listed and key[-1] and not running:
             self._listed = key
@@ -117,7 +117,7 @@ class CalibrationCard:
 
 
 class RecipesCard:
-    """Table of the recipes, fields and button to build some: curvatures, with one conic constant and the same terms."""
+    """Table of the recipes, and fields to build more: curvatures that share one conic constant and the added terms."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -139,7 +139,7 @@ class RecipesCard:
             self._reason = Line("reason")
 
     def _goal(self) -> BuildRecipes.Goal:
-        """What the fields say. Raises ValueError naming the one that makes no sense."""
+        """The goal from the fields. Raises ValueError naming the field that is not valid."""
         if (conic := self._conic.number) is None:
             raise ValueError("conic: must be a number")
         terms = terms_of(self._terms.value) if self._terms.value.strip() else []

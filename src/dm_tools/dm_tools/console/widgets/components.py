@@ -34,7 +34,7 @@ def folded(title: str) -> Iterator[None]:
 
 
 class DecimalField(ui.input):
-    """A field for a number as people write it: browsers read `0,02` in a field of their own for numbers as 2."""
+    """A text field for a number with point or comma: a browser's own number field would read `0,02` as 2."""
 
     def __init__(self, label: str, number: float, on_change: Callable[[], Any] | None = None) -> None:
         super().__init__(
@@ -47,11 +47,11 @@ class DecimalField(ui.input):
 
     @property
     def number(self) -> float | None:
-        """What stands in it; None = no number."""
+        """The number in the field; None = not a number."""
         return decimal(self.value)
 
     def set_number(self, number: float) -> None:
-        """Put a number in it, unless it stands there in other signs."""
+        """Set the number, unless the field already holds it in another notation."""
         if self.number != number:
             self.set_value(f"{number:g}")
 
@@ -59,25 +59,25 @@ class DecimalField(ui.input):
 class ActionButton(ui.element):
     """A button that is disabled with its reason as a tooltip; a click calls `on_click` with the arguments.
 
-    One with an `outline` is for what is not the main thing to do.
+    `outline` marks a secondary action.
     """
 
     def __init__(self, text: str, on_click: Callable[..., Any], *arguments: Any, outline: bool = False) -> None:
         super().__init__("span")
         with self:
             self._button = ui.button(text, on_click=partial(on_click, *arguments)).props("no-caps unelevated")
-            # The words of a filled button have their colour from the page's style, which knows of the dark.
+            # The page's style sets the text colour of a filled button, so that it fits the dark scheme too.
             self._button.props("outline" if outline else "text-color=none")
 
     def allow(self, reason: str) -> None:
         """Enable it when `reason` is empty, else disable it and say why."""
         self._button.set_enabled(not reason)
-        if reason != self.props.get("title"):  # about the button: a disabled one shows no tooltip
+        if reason != self.props.get("title"):  # of the span around the button: a disabled button shows no tooltip
             self.props["title"] = reason
 
 
 class Chart(ui.element):
-    """A chart that is sent only when it changed; a text stands there while there is none.
+    """A chart that is sent only when it has changed; a text is shown in its place while there is none.
 
     Args:
         shape: class of the page's style that gives its height.
@@ -112,7 +112,7 @@ class Chart(ui.element):
 
 
 class Line(ui.label):
-    """A line of text, out of sight while it is empty; `live` = screen readers say what is new in it."""
+    """A line of text, hidden while it is empty; with `live`, screen readers announce its changes."""
 
     def __init__(self, classes: str = "text", live: bool = False) -> None:
         super().__init__("")

@@ -17,7 +17,7 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
-#: Refusals of a prediction that say nothing of the wish, which is tried again after so long, s.
+#: Transient refusals of a prediction, which say nothing about the wish, and the time until it is tried again, s.
 PASSING, AGAIN_S = (ErrorCode.TIMEOUT, ErrorCode.BUSY, ErrorCode.DRIVER_UNAVAILABLE), 2.0
 
 
@@ -28,7 +28,7 @@ class FocusCard:
         self._session = session
         self._range: tuple[float, float] | None = None
         self._asked = self._asking = self._typing = False
-        self._wish: tuple[object, ...] = ()  # and what else a prediction depends on
+        self._wish: tuple[object, ...] = ()  # and everything else that a prediction depends on
         self._predicted: tuple[object, ...] = ()  # the wish alone
         with card("Focus"):
             self._text = Line("text figures")
@@ -62,7 +62,7 @@ class FocusCard:
             self._typing = False
 
     def _request(self) -> FocusRequest:
-        """The wish. Raises ValueError when a field is empty."""
+        """The request in the fields. Raises ValueError when one is not a number."""
         curvature, conic_constant = self._number.number, self._conic.number
         if curvature is None or conic_constant is None:
             raise ValueError("curvature and conic constant must be numbers")
@@ -84,18 +84,18 @@ class FocusCard:
             self._prediction.show("")
         if wish != self._wish:
             self._wish, self._asked = wish, False
-        elif not (reason or self._asked or self._asking):  # it has stood still since the last time
+        elif not (reason or self._asked or self._asking):  # unchanged since the last refresh
             self._asked = self._asking = True
             self._predicted = wish[:3]
             background_tasks.create(self._predict())
 
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
-        """What is promised, recipes, where the mirror stands, whether its history is known, and what runs."""
+        """What a prediction depends on beside the wish: bounds, recipes, signals, known history, running operation."""
         able, state, book = snapshot.capabilities, snapshot.actuator_state, snapshot.recipes
         promised = (able.calibration_id, able.error_bound, able.error_bound_conditioned) if able is not None else ()
         recipes = (len(book.recipes), str(book.stamp)) if book is not None else ()
         stands = () if state is None else (state.history_known, *(round(each, 1) for each in state.requested))
-        return *promised, *recipes, *stands, self._session.running  # corrections of creep do not move it so far
+        return *promised, *recipes, *stands, self._session.running  # corrections of creep are below the rounding
 
     def _take_range(self, snapshot: Snapshot) -> None:
         capabilities = snapshot.capabilities
@@ -116,7 +116,7 @@ class FocusCard:
         )
         if found != self._range:
             self._range = found
-            # As numbers: what `props()` reads from a text is text to the browser, whose slider then ignores the mouse.
+            # Set as numbers: values that `props()` parses from a string stay strings, and the slider ignores the mouse.
             self._slider.props["min"] = round(math.ceil(found[0] / STEP) * STEP, 4)
             self._slider.props["max"] = round(math.floor(found[1] / STEP) * STEP, 4)
 

@@ -1,4 +1,4 @@
-"""What the page says of the bench: the header, always in sight, and the cards of log and diagnostics."""
+"""Messages about the bench: the header, which is always visible, and the cards of log and diagnostics."""
 
 from functools import partial
 from html import escape
@@ -29,7 +29,7 @@ class Header:
                     self._text = Line("text figures")
                     self._cancel = ActionButton("Cancel", session.cancel, outline=True)
                 self._outcome = Line("text outcome", live=True)
-        # Apart from the header, at the foot of the window: it comes and goes without moving anything.
+        # At the foot of the window, apart from the header: failures come and go without moving anything.
         with ui.element("footer").classes("foot"):
             self._failures = ui.element("div").classes("failures")
             self._failures.props('role="alert" aria-live="assertive" aria-label="Errors"')
@@ -74,7 +74,7 @@ class Header:
 
 
 def _short(text: str) -> str:
-    """HTML of a sentence with its paths shortened; the whole of it is the tooltip."""
+    """HTML of a sentence with its paths shortened; the tooltip shows the full text."""
     short = shortened(text)
     return escape(short) if short == text else f'<span title="{escape(text)}">{escape(short)}</span>'
 
@@ -91,7 +91,7 @@ def _table(rows: list[tuple[str, str, str, str]]) -> str:
 
 
 class DiagnosticsCard:
-    """What the nodes say of their health, the worst first."""
+    """The health that the nodes report, the worst first."""
 
     def __init__(self) -> None:
         with folded("Diagnostics"):

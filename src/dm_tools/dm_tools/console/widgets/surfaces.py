@@ -16,11 +16,11 @@ from dm_tools.console.surfaces import Surface
 from dm_tools.console.view_models import bars
 from dm_tools.console.widgets.components import ActionButton, Chart, Line, card
 
-#: Share of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
+#: Percentage of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
 COVERED = 99.5
-#: What the second panel shows, by whether it is of the moment of the map.
+#: Title of the second panel; True = the prediction is for the moment of the map.
 PREDICTED = {True: "Predicted for the map", False: "Predicted now"}
-#: What the bars show, by whether it is a difference.
+#: What the bars show; True = a difference.
 KINDS = {True: "Measured − predicted", False: "Measured"}
 
 
