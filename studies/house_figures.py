@@ -50,9 +50,9 @@ callbacks = {each.topic_name.rsplit("/", 1)[-1]: each.callback for each in node.
 rest = [0.0] * 37
 callbacks["mirror_info"](focus_bench.mirror_info())
 callbacks["calibration"](focus_bench.calibration_with_history(focus_bench.make_law()))
-callbacks["actuator_state"](ActuatorState(
-    driver_state=ActuatorState.STATE_ACTIVE, requested=rest, applied=rest, history_known=True,
-    stamp=node.get_clock().now().to_msg()))
+state = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, requested=rest, applied=rest, history_known=True)
+state.header.stamp = node.get_clock().now().to_msg()
+callbacks["actuator_state"](state)
 files, calls, published = {}, [], []
 source = os.path.realpath(os.path.join(sys.argv[1], "src"))
 
