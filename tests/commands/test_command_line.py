@@ -388,6 +388,25 @@ def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     assert said.endswith("error: interrupted\n")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_told_to_end_ends_in_order(number: signal.Signals, tmp_path: Path) -> None:
+    """By `timeout`, systemd, or a terminal that is closed: a run is cancelled as by Ctrl-C."""
+    before = signal.signal(number, signal.SIG_DFL)  # what nohup ignores, the command would ignore as well
+    command = [sys.executable, "-m", "dm_tools", "record", "--out", str(tmp_path / "recording")]
+    with own_domain() as domain:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+        started = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+        )
+        signal.signal(number, before)
+        assert started.stdout is not None
+        said = next(line for line in started.stdout if "recording into" in line)
+        started.send_signal(number)
+        said += started.communicate(timeout=300)[0]
+    assert "stopping" in said and "nothing was recorded" in said and started.returncode == cli.NOT_RUNNING, said
+
+
 def test_a_command_that_is_interrupted_while_its_words_are_read_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

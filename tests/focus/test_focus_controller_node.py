@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -195,6 +196,41 @@ def test_cancel_holds_the_shape_reached_and_the_newest_goal_preempts(bench: Benc
     assert first.result().result.error_code == ErrorCode.PREEMPTED
     wait_until(second.done)
     assert second.result().result.error_code == ErrorCode.OK
+
+
+def test_a_goal_that_is_refused_does_not_end_the_one_that_runs(bench: Bench) -> None:
+    bench.follow = False
+    bench.ready()
+    _, running = bench.observer.send_goal(MoveFocus, "move_focus", MoveFocus.Goal(request=FocusRequest(curvature=0.01)))
+    wait_until(lambda: len(bench.commands) == 1)
+    for wrong, code in ((0.5, ErrorCode.UNREACHABLE), (math.nan, ErrorCode.NOT_FINITE)):
+        goal = MoveFocus.Goal(request=FocusRequest(curvature=wrong))
+        refused = bench.observer.run_goal(MoveFocus, "move_focus", goal).result
+        assert refused.error_code == refused.state.error_code == code and not running.done(), refused.message
+    bench.publish_state(list(bench.commands[-1].signals))
+    wait_until(running.done)
+    assert running.result().result.error_code == ErrorCode.OK, running.result().result.message
+
+
+def test_a_shape_that_is_overtaken_while_it_settles_is_not_waited_for(bench: Bench) -> None:
+    bench.ready()
+    goal = MoveFocus.Goal(request=FocusRequest(curvature=0.01), settle_time=3600.0)
+    _, result = bench.observer.send_goal(MoveFocus, "move_focus", goal)
+    wait_until(lambda: bench.focus_states and bench.focus_states[-1].applied)
+    bench.request.publish(FocusRequest(curvature=0.02))
+    wait_until(result.done)
+    assert result.result().result.error_code == ErrorCode.PREEMPTED
+
+
+def test_a_call_that_waits_for_the_driver_keeps_no_other_waiting(bench: Bench) -> None:
+    bench.follow = False
+    bench.ready()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(bench.set_focus, curvature=0.01)
+        wait_until(lambda: len(bench.commands) == 1)
+        assert bench.set_focus(curvature=0.02, dry_run=True).error_code == ErrorCode.OK
+        assert not waiting.done()
+        assert waiting.result(60.0).error_code == ErrorCode.PREEMPTED
 
 
 def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_is_active_again(bench: Bench) -> None:

@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,7 @@ from std_srvs.srv import SetBool
 from dm_autofocus import CameraFocusClient
 from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
-from dm_client.connection import checked
 from dm_common.ros import qos
-from dm_common.ros.clients import call
 from dm_common.ros.domains import own_domain
 from fault_injection.rigs.forked_node import ForkedSuite
 from support import fast_bench, wait_until
@@ -223,22 +222,29 @@ def test_taking_over_is_explicit_and_ends_the_run(bench: Bench) -> None:
 def test_whoever_holds_the_mirror_has_every_request_carried_out(bench: Bench) -> None:
     client = bench.client
     held = HoldMirror.Request(holder="my_stack", purpose="tracking", lease=60.0)
-    hold = client.node.create_client(HoldMirror, "hold_mirror")
-    checked(call(hold, held, 10.0))
+    client.call("hold_mirror", held)
     assert client.wait(lambda: client.actuator_state.holder == "my_stack")
     for refused in (client.flatten, client.update_calibration, client.degauss, lambda: client.converge(0.01)):
         with pytest.raises(DeformableMirrorError, match="my_stack has held the mirror") as busy:
             refused()
         assert busy.value.error_code == ErrorCode.BUSY
     assert client.flatten(holder="my_stack").applied
-    assert client.move_focus(0.01, holder="my_stack").state.applied
+    with ThreadPoolExecutor(1) as pool:
+        settling = threading.Event()
+        moved = pool.submit(
+            client.move_focus, 0.01, settle_time=2.0, holder="my_stack", on_feedback=lambda _feedback: settling.set()
+        )
+        assert settling.wait(10.0)
+        with pytest.raises(DeformableMirrorError, match="my_stack has held the mirror"):
+            client.move_focus(0.02)
+        assert moved.result(30.0).state.applied
     assert client.converge(0.01, tolerance=1e-6, holder="my_stack").maps > 0
     assert client.actuator_state.holder == "my_stack"
     assert client.converge(0.01, tolerance=1e-6, take_over=True).maps > 0
     assert client.wait(lambda: client.actuator_state.holder == "")
     held.operation = HoldMirror.Request.RENEW
     with pytest.raises(DeformableMirrorError, match="focus_controller has taken the mirror over"):
-        checked(call(hold, held, 10.0))
+        client.call("hold_mirror", held)
 
 
 def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:

@@ -17,6 +17,7 @@ from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
     Flatten,
+    HoldMirror,
     IngestFile,
     ListCalibrations,
     LoadCalibration,
@@ -39,7 +40,12 @@ TOPICS = {
     "actuator_state": (ActuatorState, qos.STATE),
 }
 WATCHED: Watched = {
-    "pdm_driver": (MirrorInfo, "mirror_info", qos.LATCHED, {"set_signals": SetSignals, "degauss": Degauss}),
+    "pdm_driver": (
+        MirrorInfo,
+        "mirror_info",
+        qos.LATCHED,
+        {"set_signals": SetSignals, "degauss": Degauss, "hold_mirror": HoldMirror},
+    ),
     "interferometer": (SurfaceMapInfo, "surface_map_info", qos.STATE, {"measure": Measure, "ingest_file": IngestFile}),
     "calibration": (
         Calibration,

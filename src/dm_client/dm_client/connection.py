@@ -38,6 +38,7 @@ RESTING = (
     ErrorCode.ELECTRONICS_UNREACHABLE,
 )
 CLOSED = "the client has been closed"
+ENDED = "rclpy was shut down in this process, for example by a signal"
 #: Allowed ROS domains.
 DOMAINS = range(233)
 #: Numbers for the node names of several connections in one process.
@@ -180,8 +181,12 @@ class Connection:
         return True
 
     def _check_open(self) -> None:
-        if self._closed:
-            raise DeformableMirrorError(ErrorCode.CANCELED, CLOSED)
+        if over := self._over():
+            raise DeformableMirrorError(ErrorCode.CANCELED, over)
+
+    def _over(self) -> str:
+        """Why nothing can be called any more; "" = it can. Handlers of `rclpy.init()` end all contexts of a process."""
+        return CLOSED if self._closed else "" if self._context.ok() else ENDED
 
     def stamped(self, topic: str, stamp: Any, code: int = ErrorCode.TIMEOUT) -> Any:
         """The message of a topic with the given stamp; raise DeformableMirrorError if it does not arrive."""
@@ -258,19 +263,22 @@ class Connection:
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
             raise DeformableMirrorError(ErrorCode.BUSY, text)
+        if name not in self.clients:
+            text = f"{name!r}: must be one of {', '.join(self.clients)}"
+            raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         server = self._servers.get(name)  # None for a client that the user of this class has added
         if server is not None:
             server.wait_for_return()
         lost = server.since_now() if server is not None else lambda: ""
 
         def gone() -> str:
-            return CLOSED if self._closed else lost()
+            return self._over() or lost()
 
         try:
             yield gone
         except Exception as error:
-            if self._closed:  # whatever rclpy reports of destroyed objects
-                raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {CLOSED}") from error
+            if over := self._over():  # whatever rclpy reports of destroyed objects
+                raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {over}") from error
             if not isinstance(error, ServiceCallError):
                 raise
             code, text = error.error_code, str(error)

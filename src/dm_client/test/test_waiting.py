@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,6 +25,7 @@ def client(driver: int, able: int | None) -> DeformableMirrorClient:
     """One that has heard this state of the driver and this code of the controller; None = there is no controller."""
     heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
     heard._background = SimpleNamespace(is_here=False)  # type: ignore[assignment]
+    heard._context = SimpleNamespace(ok=lambda: True)
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
@@ -118,6 +120,25 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
     assert len(told) == 6 and all(text.endswith("the client has been closed") for text in told)
     with pytest.raises(DeformableMirrorError, match="the client has been closed"):
         mirror.hear("another", ActuatorState, 1)
+
+
+def test_who_waits_hears_that_rclpy_was_shut_down(domain: int) -> None:
+    """As handlers of `rclpy.init()` do at a signal: they end every context of the process."""
+    with DeformableMirrorClient(domain=domain, timeout_s=60.0) as mirror, ThreadPoolExecutor(2) as pool:
+        waits = pool.submit(mirror.move_focus, 0.01), pool.submit(mirror.latest, "calibration", 60.0)
+        time.sleep(0.3)
+        mirror.node.context.try_shutdown()
+        for waiting in waits:
+            with pytest.raises(DeformableMirrorError, match="rclpy was shut down"):
+                waiting.result(10.0)
+
+
+def test_a_name_that_is_not_served_is_refused(domain: int) -> None:
+    with DeformableMirrorClient(domain=domain) as mirror:
+        for ask in (lambda: mirror.call("nonsense", None), lambda: mirror.run_action("nonsense", None, print, 1.0)):
+            with pytest.raises(DeformableMirrorError, match=r"'nonsense': must be one of .*, hold_mirror") as refused:
+                ask()
+            assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 
 
 def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -> None:

@@ -26,7 +26,7 @@ from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import health
 from dm_controller.focus_parameters import MOVE_FOCUS, PARAMETERS
-from dm_controller.focus_types import Effect, Moment, Order, StartDegauss
+from dm_controller.focus_types import Effect, Moment, Order, Progress, StartDegauss
 
 #: Polling period of an order, s, by an action and by a service; period of feedback, s.
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
@@ -120,20 +120,25 @@ class FocusHost(ManagedNode, ABC):
         return self._serve(flat, request.dry_run, response)
 
     def _serve(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        """Answer in a worker thread, because it waits for the driver's confirmation."""
+        """The answer, or a function that waits for the driver's confirmation first, in a thread of its own."""
         self.await_start()
         order = self.order(request, dry_run)
         deadline = time.monotonic() + GRACE_S + (self._values["driver_timeout"] or CONFIRM_S)
-        while waits := not (dry_run or order.pending or order.applied or order.refusal):
-            if time.monotonic() > deadline:
-                break
-            time.sleep(SERVICE_POLL_S)
-        response.state = state = self.answer(order)
-        response.error_code, response.message = state.error_code, state.message
-        if waits:
-            response.error_code = ErrorCode.TIMEOUT
-            response.message = "the driver has not confirmed the command in time"
-        return response
+
+        def end() -> Any:
+            """Wait for the driver. Meanwhile the next request is served; if it moves the mirror, it ends this wait."""
+            while waits := not (dry_run or order.pending or order.applied or order.refusal):
+                if time.monotonic() > deadline:
+                    break
+                time.sleep(SERVICE_POLL_S)
+            response.state = state = self.answer(order)
+            response.error_code, response.message = state.error_code, state.message
+            if waits:
+                response.error_code = ErrorCode.TIMEOUT
+                response.message = "the driver has not confirmed the command in time"
+            return response
+
+        return end() if dry_run or order.refusal else end
 
 
 class MoveFocusAction:
@@ -147,8 +152,17 @@ class MoveFocusAction:
     def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
         self._node, self._values = node, values
         self._server = WorkerActionServer(
-            node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS
+            node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS, admit=self._admit
         )
+
+    def _admit(self, goal: MoveFocus.Goal) -> None:
+        """Raise the Refusal of a goal that would be refused: it must not end the goal that is running."""
+        if self._server.busy:
+            with self._node.controller() as (controller, now):
+                order = controller.request(goal.request, now, dry_run=True)[0]
+                refusal = order.refusal or controller.monitor.held(goal.request)
+            if refusal is not None:
+                raise refusal
 
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
         started, result = time.monotonic(), without_figures(MoveFocus.Result())
@@ -183,8 +197,9 @@ class MoveFocusAction:
         if ended is not None:
             return ended
         handle.publish_feedback(MoveFocus.Feedback(phase="settling", progress=1.0))
-        if not sleep(node.get_clock(), goal.settle_time or self._values["settle_time"], lambda: self._to_stop(handle)):
-            return self._stopped(handle, order)
+        settle = goal.settle_time or self._values["settle_time"]
+        if not sleep(node.get_clock(), settle, lambda: self._to_stop(handle) or self._progress(order).failed):
+            return self._follow(handle, order) or self._stopped(handle, order)
         stands = f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
         return self._follow(handle, order) or ("succeed", ErrorCode.OK, stands)
 
@@ -192,8 +207,7 @@ class MoveFocusAction:
         """Wait until the shape of `order` is reached; returns None when it is."""
         next_feedback = 0.0
         while True:
-            with self._node.controller() as (controller, now):
-                progress = controller.monitor.progress(order, now.steady)
+            progress = self._progress(order)
             if progress.stands:
                 return None
             if progress.failed is not None:
@@ -207,6 +221,10 @@ class MoveFocusAction:
                     MoveFocus.Feedback(phase=phase, progress=progress.share, remaining=progress.remaining)
                 )
             time.sleep(POLL_S)
+
+    def _progress(self, order: Order) -> Progress:
+        with self._node.controller() as (controller, now):
+            return controller.monitor.progress(order, now.steady)
 
     def _to_stop(self, handle: WorkerGoal) -> bool:
         return handle.is_cancel_requested or self._server.preempted(handle)

@@ -173,6 +173,9 @@ def _set_environment() -> None:
 def run(words: list[str], name: str) -> None:
     """Run the command, called by this name with these words, and end the process with its exit status."""
     _set_environment()
+    for number in (signal.SIGTERM, signal.SIGHUP):  # these cancel a run as Ctrl-C does, so that the mirror is released
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, signal.default_int_handler)
     try:
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them

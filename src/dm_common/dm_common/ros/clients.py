@@ -15,12 +15,11 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 
-#: How often a hold is renewed, s: several times within the driver's lease of 3 s.
-RENEW_S = 0.7
-#: Longest wait for the driver to release a hold, s; otherwise the hold ends with its lease.
-RELEASE_S = 1.0
-#: Longest wait for the end of a goal that was cancelled, s.
-CANCEL_S = 20.0
+#: How often a hold is renewed, s: several times within the lease of 3 s. Longest wait for its release, s, after
+#: which it ends with its lease.
+RENEW_S, RELEASE_S = 0.7, 1.0
+#: Longest wait for the end of a cancelled goal; time for a cancel to go out where no answer can come any more, s.
+CANCEL_S, SEND_S = 20.0, 0.5
 
 
 class ServiceCallError(Exception):
@@ -171,6 +170,7 @@ def run_goal(
         with suppress(ServiceCallError):
             wait(accepted.done, answer_s, "no answer to the goal")
             accepted.result().cancel_goal_async()
+            time.sleep(SEND_S if gone() else 0.0)
             became = "asked to cancel; it ends with what is under way, such as a fit (./dm status)"
             finished = accepted.result().get_result_async()
             wait(finished.done, CANCEL_S, "not finished")

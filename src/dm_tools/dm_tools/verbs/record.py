@@ -32,15 +32,13 @@ def record(
     from dm_tools.recording.bag import PARAMETER_EVENTS
     from dm_tools.recording.recorder import COMMON, Recorder
 
-    # SIGTERM must finish the file as Ctrl-C does; set both: shells start background commands with SIGINT ignored.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background commands with SIGINT ignored
     folder = out if out is not None else Path("runs") / time.strftime("recording-%Y%m%dT%H%M%S")
     names = [name.strip() for name in topics.split(",") if name.strip()]
     started = time.monotonic()
     with Recorder(folder, namespace, names, maps) as recorder:
-        console.print(f"recording into {folder}; Ctrl-C ends it")
         try:
+            console.print(f"recording into {folder}; Ctrl-C ends it")
             with console.status("") as status:
                 while not duration or time.monotonic() - started < duration:
                     recorder.check()

@@ -80,8 +80,9 @@ def up(
     # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
     # because a shell starts commands in the background with SIGINT ignored.
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: stop.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores it
+            signal.signal(number, lambda _number, _frame: stop.set())
     from dm_bringup.suite import Suite
     from dm_tools.doctor.bench import effective, sound_values, taken_ports
 
