@@ -21,6 +21,8 @@ FIND_S = 1.2
 BUSY_S = 5.0
 #: Time in which every node reports its health, and an action its progress, s.
 REPORT_S = 1.5
+#: A predicted error is mentioned from this size on, m.
+MENTIONED = 0.5e-9
 
 #: Nodes without which there is no bench, and the effect when one is missing.
 NEEDED = {

@@ -20,8 +20,8 @@ STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
 #: Error of moves after a run of one map per actuator, for a mirror never calibrated, m; it falls with the root of the
-#: number of maps. Median of 29 mirrors drawn at random (seeds 7646 to 7675): 1.5 nm after 314 maps. One mirror in ten
-#: only reached 3.0 nm.
+#: number of maps. Median of 29 mirrors drawn at random (7646 to 7675 but 7650): 1.5 nm after 314 maps. One mirror in
+#: ten reached only 3.0 nm.
 TYPICAL_LAW = 4.5e-9
 #: If the error of a run exceeds the typical one by this factor, the law has most likely not been found yet.
 WORST_LAW = 2.2

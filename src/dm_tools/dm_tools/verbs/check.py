@@ -17,6 +17,7 @@ from dm_tools.output import (
 )
 from dm_tools.running_suite import (
     BUSY_S,
+    MENTIONED,
     REPORT_S,
     hear_health,
     kept,
@@ -28,9 +29,6 @@ from dm_tools.running_suite import (
     unknown_history,
     verdict,
 )
-
-#: A predicted error is mentioned from this size on, m.
-MENTIONED = 0.5e-9
 
 
 def check(

@@ -4,10 +4,10 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import two_fold
+from dm_common.figures import in_nanometres, two_fold
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
-from dm_tools.running_suite import REPORT_S, naming_holder, promise, running_suite
+from dm_tools.running_suite import MENTIONED, REPORT_S, naming_holder, promise, running_suite
 
 
 def focus(
@@ -85,14 +85,18 @@ def _calibration(client: Any) -> Any:
 
 def _show(state: Any, calibration: Any) -> None:
     """Print what a dm_msgs/FocusState promises, made with this dm_msgs/Calibration, None = not known."""
+    predicted = state.predicted_max_zernike
+    predicted_part = f", of which {in_nanometres(predicted)} are predicted" if predicted >= MENTIONED else ""
     console.print(
         f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
-        f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient; "
+        f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient{predicted_part}; "
         f"reachable {range_text(state.curvature_min, state.curvature_max, '1/m')}",
         soft_wrap=True,
     )
     if calibration is not None:
-        console.print(two_fold(state.predicted_max_zernike_upper, calibration, state.curvature), soft_wrap=True)
+        console.print(
+            two_fold(state.predicted_max_zernike_upper - predicted, calibration, state.curvature), soft_wrap=True
+        )
     if state.saturated:
         console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
     if remarks := state.message.partition("; ")[2]:
