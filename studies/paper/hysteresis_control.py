@@ -29,9 +29,9 @@ class Estimate:
     a measurement as the map after it.
 
     Attributes:
-        noise: standard deviation of the largest coefficient of a map, m.
+        noise: of a map, m: typical size of its largest coefficient error.
         error: best estimate of measured less wanted; None before the first map.
-        variance: of this estimate, for the largest coefficient, m^2.
+        variance: of this estimate, m^2, in the same terms as `noise`.
     """
 
     noise: float

@@ -13,8 +13,8 @@ from dm_common import Floats
 SLACK = 1e-9
 #: Signals closer to a limit than this count as standing at it.
 AT_LIMIT = 1e-6
-#: Fewest half-swings of a degauss. With n of them up to 1 / (2 n) of the first remains; if that is more than a tenth,
-#: the state is not the demagnetised one that is assumed after a degauss.
+#: Fewest half-swings of a degauss that wipes the hysteresis. With n of them up to 1 / (2 n) of the first remains; if
+#: that is more than a tenth, the state is not the demagnetised one that is assumed after a degauss.
 DEGAUSS_STEPS_MIN = 5
 #: Most half-swings of a degauss: with more, the last ones would be smaller than a step of the electronics.
 DEGAUSS_STEPS_MAX = 10000

@@ -221,7 +221,7 @@ class WriterThread:
         if not first and time.monotonic() - self._write_at > limits.step / limits.slew_rate:
             self.counters.overruns += 1
         if queue.turns != self._turns_published:
-            self._publish(True)  # this move began at a turn, and another follows if it is a single step
+            self._publish(True)  # this move began at a turn, and another may follow if it is a single step
         self._write(previous, shape)
         with self._change:
             ended = queue.step_written(move, self._applied)

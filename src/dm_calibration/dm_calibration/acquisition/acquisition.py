@@ -21,7 +21,7 @@ from dm_common.measurement import Measurement
 from dm_common.values import parameter, real, text, texts
 
 _POLL_OUTPUT_S = 0.01
-#: A watched file's modification time is not believed if it is further in the past: clocks of two machines may differ.
+#: A watched file's modification time is not believed if further in the past than this: two machines' clocks may differ.
 _RECENT_NS = 60 * 10**9
 #: An unreadable folder causes a warning after this time only, s: the program that creates it may still be starting.
 FOLDER_PATIENCE_S = 5.0

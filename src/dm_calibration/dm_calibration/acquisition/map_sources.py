@@ -77,7 +77,7 @@ def outcome_of(
     if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
         raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
     outcome = Outcome()
-    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # an actuator that never moves is at rest
+    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # one that never moves rests where it is
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
     kinds = _kinds(np.abs(signals - rest) > 1e-9, hysteresis)
     for number, (one, row, kind) in enumerate(zip(measured, signals, kinds, strict=True)):

@@ -51,7 +51,7 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     shared = _posterior(evidence / excess, prior)
     # Evidence of one actuator while all others are free; a dead one has none. Left out are the three patterns that no
     # response holds, piston and tilt. Each dead actuator is a hidden pattern by itself and replaces one of these three,
-    # which the others cannot form without it. Three actuators or fewer with a response have no such pattern.
+    # which the others cannot form without it. A mirror of three actuators or fewer has no such pattern.
     moves = np.linalg.norm(gains, axis=1)
     alive = moves > DEAD * moves.max()
     hidden = max(PISTON_TILT if len(gains) > PISTON_TILT else 0, int((~alive).sum()))

@@ -5,11 +5,11 @@ A map measures the displacements of all N actuators, so one run serves all of th
 where the mirror is flat, every other shape is as in use: of low order, with random signals of each actuator on top,
 about the flat mirror. Actuators that flatten a figure then stay near an end of their range, where random shapes hardly
 come. Creep over minutes shows only if the mean shape over minutes is not flat: the first half of the shapes as in use
-bend the mirror one way, the second half the other way. Random shapes that are held now and then lie near a bowl, later
-near its inverse. Maps taken early show creep of the first second. The last fifth are moves as in use alone, kept to
-test the law found from the others. They begin with a degauss, and if they are many another comes halfway. Only maps
-after a degauss show the offset between demagnetised actuators and the mean of their loops; without them the fit puts it
-into the figure, and requests after a degauss are off by a constant.
+bend the mirror one way, the second half the other way. Random shapes held now and then lie near a bowl in their first
+half, then near its inverse. Maps taken early show creep of the first second. The last fifth are moves as in use alone,
+kept to test the law found from the others. They begin with a degauss, and if they are many another comes halfway. Only
+maps after a degauss show the offset between demagnetised actuators and the mean of their loops; without them the fit
+puts it into the figure, and requests after a degauss are off by a constant.
 """
 
 from dataclasses import dataclass

@@ -166,7 +166,7 @@ def _pitch(header: Header) -> float | None:
 
 
 def _time(text: str) -> float | None:
-    """s since the epoch, of a DATE-OBS in UTC; None = not given, or without a time of day."""
+    """s since the epoch, of a DATE-OBS in UTC; None = not given, no time, or without a time of day."""
     try:
         return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp() if "T" in text else None
     except ValueError:

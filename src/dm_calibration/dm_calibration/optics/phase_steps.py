@@ -87,7 +87,7 @@ def _steps(
 
 
 def _slope(sag: Floats, at: NDArray[np.int_], axis: int, way: int, fringe: float) -> Floats:
-    """m per pixel along `axis` at the pixels `at` (2, B), to the neighbour in direction `way`; 0 across a step."""
+    """m per pixel along `axis` at the pixels `at` (2, B), to the neighbour in direction `way`; 0 at steps and gaps."""
     beside = at.copy()
     beside[axis] = np.clip(beside[axis] + way, 0, sag.shape[axis] - 1)
     slope = way * (sag[tuple(beside)] - sag[tuple(at)])

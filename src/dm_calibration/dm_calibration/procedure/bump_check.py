@@ -17,8 +17,8 @@ from dm_common.values import live_parameter, real
 
 #: Uncertainty of the place of an aperture that is found on a map, pixels.
 _WANDER_PX = 1.5
-#: Factor on the allowance because actuators that moved together err together, which exceeds the rms sum of independent
-#: errors. A run whose held shapes are bowls in one half and inverted bowls in the other left 1.3 to 1.6 times as much.
+#: Factor on the allowance: errors of actuators that moved together exceed the rms sum of independent ones. A run whose
+#: held shapes alone lean to a bowl in one half and to its inverse in the other left 1.3 to 1.6 times as much.
 _TOGETHER = 2.0
 
 

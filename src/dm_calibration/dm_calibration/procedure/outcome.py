@@ -86,7 +86,7 @@ def without_map(record: Measurement, **changes: Any) -> Unseen:
 
 @dataclass(frozen=True)
 class Dropped:
-    """No map of `step` could be taken in one try; `whole`: the step is given up."""
+    """A map of `step` could not be taken; `whole`: the step is given up."""
 
     step: int
     reason: str

@@ -260,7 +260,7 @@ class DriftFilter:
         return float((np.abs(self._fit.influence_zernike[PISTON_TILT:]) @ self._creeping_on(drift)).max())
 
     def _creeping_on(self, drift: Drift) -> Floats:
-        """(N,) bound of the creep of stuck actuators since then, in effective signal; 0 for the others."""
+        """(N,) bound of the further creep of stuck actuators, in effective signal; 0 for the others."""
         return STUCK_DECADES * self._creep_law.creep_rate * np.nan_to_num(1.0 + np.abs(drift.stuck))
 
     def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:

@@ -287,7 +287,7 @@ def random_histories(
 def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
     """Range of effective signals that signals of `low` .. `high` reach whatever the history.
 
-    Hysteresis and creep narrow it; this is the narrowest range over random histories.
+    Hysteresis and creep narrow it; each end is the least that any of the random histories leaves.
     """
     ends: dict[float, list[Floats]] = {low: [], high: []}
     for state in random_histories(law, low, high, np.random.default_rng(0)):

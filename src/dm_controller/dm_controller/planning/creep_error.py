@@ -13,7 +13,7 @@ from dm_controller.planning.mirror_model import SIGMAS_95
 AGES = (1.0, 10.0, 100.0)
 #: Time after `crept_at` to which the figure refers, including creep left then, s: half of a typical run.
 IN_FIGURE_S = 200.0
-#: 95 % quantile, in standard deviations, of one error, and of the largest of as many as a mirror has coefficients.
+#: 95 % quantiles, in standard deviations: of one error, of the largest of as many independent ones as coefficients.
 ONE, LARGEST = SIGMAS_95, 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)

@@ -127,8 +127,8 @@ class Corrections:
         self._repeat = REPEAT_SHARE * held_out
 
     def _other_tilt(self, own: Floats) -> Floats:
-        """(R, N) effective signals of the tilt that recipes added to the model's `own` (R, N), unless corrections bring
-        it along or a limit has cut it: such recipes were built for another axis, or while tilt was free.
+        """(R, N) effective signals of the tilt that recipes added to the model's `own` (R, N), as those built for
+        another axis or while tilt was free do; 0 where corrections bring it along or a limit has cut it.
         """
         mirror, count = self._mirror, len(own)
         if mirror.tilt is None:

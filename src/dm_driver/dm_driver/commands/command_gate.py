@@ -1,4 +1,4 @@
-"""Checks that every command passes before the writer: driver configured, mirror not held. Knows no ROS."""
+"""Checks that every command passes before the writer: driver configured, mirror not held by another. Knows no ROS."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -26,8 +26,8 @@ METADATA_FILE, SUFFIX = "metadata.yaml", ".mcap"
 MAGIC = b"\x89MCAP0\r\n"
 #: Topic on which nodes publish their parameters.
 PARAMETER_EVENTS = "/parameter_events"
-#: Recorded messages reach the disk with the first message that is later than this, ns, or by `BagWriter.flush`; the
-#: rest is lost when the recorder is killed or loses its power.
+#: Recorded messages reach the disk with the first message that is later by more than this, ns, or by
+#: `BagWriter.flush`; the rest is lost when the recorder is killed or loses its power.
 FLUSH_NS = 4 * 10**9
 #: The library writes no checksums of its own; those of zstd are verified by every decompressor.
 CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
