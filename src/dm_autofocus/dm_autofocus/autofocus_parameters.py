@@ -24,9 +24,9 @@ PARAMETERS: Final = (
     Parameter(
         "optics.focal_length_px",
         real(0.0, 0.0, 1e7, "px"),
-        "Focal length of the camera over its pixel pitch; 0 = fx of camera_info. With it a search takes few images.",
+        "Focal length of the camera / its pixel pitch; 0 = fx of camera_info. If known, a search takes few images.",
     ),
-    Parameter("metric", text("tenengrad", choices=tuple(METRICS)), "Figure of sharpness.", live=True),
+    Parameter("metric", text("tenengrad", choices=tuple(METRICS)), "Measure of sharpness.", live=True),
     Parameter(
         "region",
         reals([0.25, 0.25, 0.5, 0.5], 0.0, 1.0),
@@ -38,14 +38,14 @@ PARAMETERS: Final = (
         text("raw", choices=("raw", "compressed")),
         "raw: images come on image_raw; compressed: as JPEG or PNG on image_raw/compressed.",
     ),
-    Parameter("images_per_step", whole(1, 1, 100), "Images whose median sharpness counts at each position."),
+    Parameter("images_per_step", whole(1, 1, 100), "Images per position; their median sharpness counts."),
     Parameter("image_timeout", real(2.0, 0.01, 600.0, "s"), "Longest wait for an image that counts."),
     Parameter("move_timeout", real(5.0, 0.01, 600.0, "s"), "Longest wait for a move to end."),
     Parameter("settle_time", real(0.01, 0.0, 60.0, "s"), "Wait after the last write before images count."),
     Parameter(
         "stamp_lead",
         real(0.0, -1.0, 10.0, "s"),
-        "By how much an exposure begins before its image's stamp; 0 = stamps mark the beginning.",
+        "Time from the start of an exposure to its image's stamp; 0 = the stamp marks the start.",
     ),
     Parameter("monitor_rate", real(5.0, 0.0, 100.0, "Hz"), "Rate of autofocus_state while idle; 0 = none."),
     Parameter(
@@ -62,7 +62,7 @@ PARAMETERS: Final = (
     Parameter(
         "search.few_images",
         switch(True),
-        "Find the focus from how blurred a few images are, where the optics are known; false = always sweep the range.",
+        "Find the focus from the blur of a few images, if the optics are known; false = always sweep the range.",
     ),
     *parameters_of("track.", TrackConfig),
     Parameter(
@@ -74,7 +74,7 @@ PARAMETERS: Final = (
     Parameter(
         "stack.cell",
         whole(4, 2, 256, "px"),
-        "Focus stack: side of the cells that have one distance each; their sharpness is that of three by three.",
+        "Focus stack: side of the cells, each with one distance; their sharpness is a mean over 3 x 3 cells.",
         live=True,
     ),
 )

@@ -56,7 +56,7 @@ class FocusOptics:
     incidence: float = parameter(real(0.0, 0.0, math.pi / 3, "rad"), "Angle of incidence on the mirror.")
     pupil_offset: float = parameter(
         real(0.0, -100.0, 100.0, "m"),
-        "How far the entrance pupil lies behind the point that object distances count from.",
+        "Distance of the entrance pupil behind the point from which object distances count.",
     )
 
     def __post_init__(self) -> None:

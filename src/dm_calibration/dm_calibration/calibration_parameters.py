@@ -19,20 +19,20 @@ PARAMETERS = (
     Parameter(
         "load_on_start",
         text(""),
-        "Calibration to use as soon as the mirror is known: empty = none, last = the one in use last (the newest that "
-        "fits where none was), newest = the newest that fits, or an id.",
+        "Calibration to load as soon as the mirror is known: empty = none, last = the one last in use (if there was "
+        "none, the newest that fits), newest = the newest that fits, or an id.",
     ),
     live(
         "write_report",
         switch(True),
-        "Write the report of every calibration that is stored, <id>.html and <id>.pdf, beside its file.",
+        "Write a report, <id>.html and <id>.pdf, beside the file of every calibration that is stored.",
     ),
     *parameters_of("", PlanOptions),
     live("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time."),
     live(
         "map_time",
         real(1.0, 0.001, 600.0, "s"),
-        "What a map is said to take until one was taken, in ROS time.",
+        "Assumed duration of a map until the first one is taken, in ROS time.",
     ),
     *parameters_of("", ProcedureOptions),
     live("driver_timeout", real(30.0, 0.1, 600.0, "s"), "Longest wait for the driver to set a shape."),
@@ -41,13 +41,13 @@ PARAMETERS = (
     live(
         "resume_max_age",
         real(43200.0, 0.0, 1e8, "s"),
-        "An interrupted run goes on with the next goal of the same plan, settings and mirror when it is not older; "
-        "0 = never.",
+        "Largest age of an interrupted run that the next goal with the same plan, settings and mirror resumes; 0 = "
+        "never resume.",
     ),
     live(
         "start_fresh",
         switch(False),
-        "The next goal sets interrupted runs aside and begins anew; false again as soon as it has begun.",
+        "The next goal sets interrupted runs aside and starts anew; becomes false as soon as it has started.",
     ),
     *parameters_of("bump.", BumpOptions),
     live(
@@ -65,31 +65,31 @@ PARAMETERS = (
     live(
         "calibrated_error_max",
         real(CALIBRATED_ERROR_MAX, 0.0, 1e-3, "m"),
-        "A calibration whose promise, the 95 % bound on the largest coefficient error of a request, is larger counts "
-        "as APPROXIMATE, as does one with actuators that are dead or were never moved (default: wavelength / 20).",
+        "A calibration counts as APPROXIMATE if its 95 % bound on the largest coefficient error of a request is "
+        "larger, or if actuators are dead or were never moved (default: wavelength / 20).",
     ),
     live(
         "updates.enable",
         switch(True),
-        "Take maps that arrive between calibrations to follow the drift of gains and figure.",
+        "Use maps that arrive between calibrations to follow the drift of gains and figure.",
     ),
     live(
         "updates.still_time",
         real(0.5, 0.0, 600.0, "s"),
-        "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
+        "Time before and after the stamp of a map in which the mirror must not move, except for creep corrections.",
     ),
     *parameters_of("updates.", UpdateOptions),
-    live("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Drift of a gain from which to warn."),
-    live("updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Drift of the figure from which to warn."),
+    live("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Relative drift of a gain above which to warn."),
+    live("updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Rms drift of the figure above which to warn."),
     live(
         "updates.stale_after",
         real(2592000.0, 1.0, 1e10, "s"),
-        "A calibration that no map has agreed with for so long is stale (default: 30 days).",
+        "A calibration is stale if no map has agreed with it for this long (default: 30 days).",
     ),
     live(
         "temperature.silent_after",
         real(60.0, 0.1, 86400.0, "s"),
-        "After so long without a message on `temperature` that of the mirror is not known.",
+        "Time without a message on `temperature` after which the mirror's temperature is not known.",
     ),
 )
 

@@ -21,7 +21,7 @@ PARAMETERS = (
     Parameter(
         "frame_id",
         text(""),
-        "Mirror surface frame (x right, y up); empty = mirror, behind the namespace where there is one.",
+        "Mirror surface frame (x right, y up); empty = mirror, preceded by the namespace if there is one.",
     ),
     Parameter(
         "watch_folder", text("", path=True), "Folder in which the instrument saves its maps; empty = watch nothing."
@@ -30,23 +30,23 @@ PARAMETERS = (
     Parameter(
         "zernike_topic",
         text(""),
-        "Topic of ZernikeCoefficients, in any convention, from a sensor such as a Shack-Hartmann, in place of map "
+        "Topic of ZernikeCoefficients (any convention) from a sensor such as a Shack-Hartmann, used instead of map "
         "files; empty = none.",
     ),
-    live("measure_timeout", real(60.0, 0.1, 86400.0, "s"), "Time limit of a measurement that asks for none."),
+    live("measure_timeout", real(60.0, 0.1, 86400.0, "s"), "Time limit of a measurement whose request sets none."),
     *parameters_of("orientation.", Orientation),
     Parameter(
         "reference_surface",
         text("", path=True),
-        "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
-        "map; empty = nothing is.",
+        "Map file of the instrument's own error, as the instrument shows it (before orientation.*), to subtract from "
+        "every map; empty = none.",
     ),
     live(
         "aperture.centre_x",
         real(0.0, -1.0, 1.0, "m"),
-        "Centre of the aperture from the oriented map's centre, x right; used with aperture.radius.",
+        "Centre of the aperture, x right, from the centre of the oriented map; used with aperture.radius.",
     ),
-    live("aperture.centre_y", real(0.0, -1.0, 1.0, "m"), "The same, y up."),
+    live("aperture.centre_y", real(0.0, -1.0, 1.0, "m"), "As aperture.centre_x, y up."),
     *parameters_of("", IngestSettings),
     live("publish_map", switch(True), "Publish the map itself, several megabytes."),
 )

@@ -22,7 +22,7 @@ LOOP_PARAMETERS = (
     live(
         "converge.creep",
         real(0.01, 0.0, 0.2),
-        "growth of a move per decade of time that a loop foresees where no creep was identified; 0 = none",
+        "creep that a closed loop assumes if none was identified: growth of a move per decade of time; 0 = none",
     ),
     live(
         "recipes.tolerance",
@@ -30,7 +30,7 @@ LOOP_PARAMETERS = (
         "largest re-measured coefficient error of a recipe",
     ),
     live("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take"),
-    live("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe"),
+    live("recipes.average", whole(8, 2, 50), "largest number of maps averaged after each degauss of a recipe"),
     Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
     Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
     Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
@@ -57,24 +57,24 @@ PARAMETERS: Final = (
     Parameter(
         "request_age",
         real(1.0, 0.0, 3600.0, "s"),
-        "focus requests stamped longer ago, or further ahead, are refused; 0 = never",
+        "focus requests stamped longer ago, or further in the future, are refused; 0 = never",
     ),
     Parameter(
         "settle_time",
         real(SETTLE_S, 0.0, 60.0, "s"),
-        "wait after the last write before a MoveFocus goal succeeds, and when a shape is to be right",
+        "wait after the last write before a MoveFocus goal succeeds; shapes are planned to be right then",
     ),
     Parameter("move_timeout", real(10.0, 0.1, 600.0, "s"), "longest time a move may take"),
     live(
         "driver_timeout",
         real(3.0, 0.0, 600.0, "s"),
-        "silence of pdm_driver after which requests are refused, and longest wait until it confirms a command; longer "
-        "than its state_period; 0 = never, and 3 s for a command",
+        "time without reports from pdm_driver after which requests are refused, and longest wait for it to confirm a "
+        "command; choose it longer than its state_period; 0 = never refuse, and 3 s for a command",
     ),
     live(
         "time_budget",
         real(0.0, 0.0, 3600.0, "s"),
-        "time in which AUTO may condition the mirror, for requests that name none; 0 = never by itself",
+        "time within which AUTO may condition the mirror, for requests that set none; 0 = AUTO does not condition",
     ),
     live(
         "condition.degauss_steps",
@@ -84,43 +84,43 @@ PARAMETERS: Final = (
             DEGAUSS_STEPS_MAX,
             zero="as the recipes were built, without recipes as the driver does",
         ),
-        "half-swings of the degauss that conditions",
+        "half-swings of the degauss that conditions the mirror",
     ),
-    live("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for that degauss"),
+    live("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for the conditioning degauss"),
     live("hold.enable", switch(True), "correct a shape for creep while it is held"),
     Parameter("hold.period", real(PERIOD_S, 0.01, 3600.0, "s"), "shortest time between two corrections"),
     live(
         "hold.tolerance",
         real(2e-10, 1e-12, 1e-6, "m"),
-        "predicted Zernike coefficient error from which a held shape is corrected",
+        "predicted Zernike coefficient error above which a held shape is corrected",
     ),
     live("hold.slew", real(0.02, 1e-5, 2.0), "largest change of a signal in one correction, normalised"),
     live(
         "hold.resolution",
         real(3.0518e-5, 0.0, 0.1),
-        "step of the electronics, normalised (16 bit over the range: 2/65535); less than half of it is not corrected",
+        "step of the electronics, normalised (16 bit over the range: 2/65535); no correction below half of it is sent",
     ),
     live(
         "calibration_age_max",
         real(2_592_000.0, 0.0, 1e9, "s"),
-        "age from which a calibration that no map has confirmed is called stale; it is still used; 0 = never",
+        "time without a map that confirms a calibration, after which it is called stale but still used; 0 = never",
     ),
     Parameter(
         "state_folder",
         text("~/.ros/focus_controller", path=True),
-        "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
+        "folder for the creep state of each mirror's actuators, which the next start reads; empty = keep nothing",
     ),
     live(
         "hold_tilt",
         switch(True),
-        "keep the mirror's tilt while its curvature changes, so that the picture of a camera stands still; "
-        "false = tilt is free",
+        "keep the mirror's tilt while its curvature changes, so that the picture of a camera does not move; false = "
+        "tilt is free",
     ),
     live(
         "optical_axis",
         reals([0.0, 0.0], -AXIS_MAX, AXIS_MAX, "m", sizes=(2,)),
-        "x and y of where the camera's axis meets the mirror, from the middle of the calibrated aperture: the picture "
-        "stands still where the vertex of the sphere stays on it; `./dm calibrate --boresight` finds it",
+        "x and y of the point where the camera's axis meets the mirror, from the centre of the calibrated aperture: "
+        "the picture does not move if the vertex of the sphere stays there; `./dm calibrate --boresight` finds it",
     ),
     *LOOP_PARAMETERS,
 )

@@ -17,11 +17,11 @@ PARAMETERS: Final = (
     Parameter(
         "frame_id",
         text(""),
-        "Mirror surface frame (x right, y up); empty = mirror, behind the namespace where there is one.",
+        "Mirror surface frame (x right, y up); empty = mirror, preceded by the namespace if there is one.",
     ),
     Parameter("state_period", real(0.5, 0.02, 60.0, "s"), "Time between periodic actuator_state messages."),
     Parameter("mirror.name", text("PDM30-37"), "Model of the mirror."),
-    Parameter("mirror.serial", text(REQUIRED), "Serial number; calibrations belong to one."),
+    Parameter("mirror.serial", text(REQUIRED), "Serial number; calibrations of another serial number are refused."),
     Parameter("mirror.actuators", whole(37, 1, 4096), "Number of actuators."),
     Parameter(
         "mirror.wiring",
@@ -31,32 +31,32 @@ PARAMETERS: Final = (
     Parameter(
         "mirror.channels",
         wholes([], -1, 4095),
-        "For the wiring 'custom': connector channel of actuator 1, 2, ..., from 0; -1 = no channel.",
+        "Wiring 'custom': connector channels (from 0) of actuators 1, 2, ...; -1 = no channel.",
     ),
     Parameter("mirror.actuator_x", reals([], -1.0, 1.0, "m"), "Actuator positions, x; empty = hexagonal pattern."),
     Parameter("mirror.actuator_y", reals([], -1.0, 1.0, "m"), "Actuator positions, y; empty = hexagonal pattern."),
-    Parameter("mirror.pitch", real(4.3e-3, 1e-5, 1.0, "m"), "Hexagonal pattern: distance of neighbours."),
+    Parameter("mirror.pitch", real(4.3e-3, 1e-5, 1.0, "m"), "Hexagonal pattern: distance between neighbours."),
     Parameter(
         "mirror.start_angle",
         real(0.0, -2 * math.pi, 2 * math.pi, "rad"),
         "Hexagonal pattern: direction of the first actuator of every ring, counter-clockwise from x.",
     ),
-    Parameter("mirror.clockwise", switch(False), "Hexagonal pattern: numbers rise clockwise."),
+    Parameter("mirror.clockwise", switch(False), "Hexagonal pattern: actuators are numbered clockwise."),
     Parameter("mirror.reflected", switch(False), "Hexagonal pattern: mirrored left-right."),
     Parameter("mirror.full_aperture_diameter", real(0.030, 1e-4, 10.0, "m"), "Diameter of the mirror."),
-    Parameter("mirror.working_aperture_diameter", real(0.022, 1e-4, 10.0, "m"), "Diameter to be used."),
+    Parameter("mirror.working_aperture_diameter", real(0.022, 1e-4, 10.0, "m"), "Diameter of the part in use."),
     Parameter("electronics.kind", text(REQUIRED, choices=tuple(BACK_ENDS)), "Drive electronics."),
     *parameters_of("electronics.", ElectronicsSettings),
     Parameter(
         "electronics.await_arrival",
         switch(True),
-        "EDAC40 over TCP: large ramps go no faster than the unit acknowledges, so that a link that vanishes in a move "
-        "leaves at most one step. False = never wait: for a unit that acknowledges late, where speed counts more.",
+        "EDAC40 over TCP: large ramps wait for acknowledgements, so that a link lost in a move leaves the outputs "
+        "within one step of the last frame. False = never wait, for units that acknowledge late if speed matters more.",
     ),
     Parameter(
         "electronics.timeout",
         real(1.0, 0.01, 60.0, "s"),
-        "Longest wait for the electronics; for a TCP connection to come about it is 5 s.",
+        "Longest wait for the electronics, except for a TCP connection to be established (5 s).",
     ),
     *parameters_of("framed_serial.", FrameFormat),
     Parameter("volts.dac_at_zero", real(REQUIRED, unit="V"), "DAC output for code 0 (EDAC40 as delivered: -6)."),
@@ -67,19 +67,19 @@ PARAMETERS: Final = (
     Parameter(
         "drive.law",
         text(LINEAR, choices=tuple(LAWS)),
-        "What is linear in the signal from volts.min to volts.max: the volts (piezo), or their square (electrostatic "
-        "membrane).",
+        "Quantity that is linear in the signal, from volts.min to volts.max: the voltage (piezo), or its square "
+        "(electrostatic membrane).",
     ),
     Parameter("limits.signal_min", real(-1.0, -1.0, 1.0), "Lowest signal."),
     Parameter("limits.signal_max", real(1.0, -1.0, 1.0), "Highest signal."),
     Parameter("limits.neighbour_difference", real(1.0, 1e-6, 2.0), "Largest difference of neighbouring signals."),
     *parameters_of("limits.", DriverLimits),
-    Parameter("limits.watchdog", real(0.0, 0.0, 1e6, "s"), "Without a command for this long: safe shape; 0 = never."),
+    Parameter("limits.watchdog", real(0.0, 0.0, 1e6, "s"), "Time without commands until the safe shape; 0 = never."),
     Parameter(
         "state_folder",
         text("~/.ros/dm_driver", path=True),
-        "Folder that keeps what was last sent to each unit: a driver that was killed goes on from there in steps. "
-        "Empty = keep nothing.",
+        "Folder for a record of what was last sent to each unit, from which a driver continues in steps after it was "
+        "killed. Empty = keep no record.",
     ),
     Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
     Parameter("degauss.steps", whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX), "Half-swings of a degauss."),

@@ -37,11 +37,11 @@ class DriverLimits(Limits):
     actuators: int
     slew_rate: float = parameter(
         real(40.0, 1e-3, 1e6, "1/s"),
-        "Largest mean rate of change of a signal; a serial line allows at most limits.step a frame.",
+        "Largest mean rate of change of a signal; over a serial line, at most limits.step per frame.",
     )
     step: float = parameter(real(0.1, 1e-4, 2.0), "Largest change of a signal in one write.")
     command_age: float = parameter(real(1.0, 1e-3, 1e9, "s"), "Commands with an older stamp are refused.")
-    command_lead: float = parameter(real(0.5, 1e-3, 1e9, "s"), "Commands stamped further ahead are refused.")
+    command_lead: float = parameter(real(0.5, 1e-3, 1e9, "s"), "Commands stamped further in the future are refused.")
     frames_per_second: float = math.inf
 
     def __post_init__(self) -> None:

@@ -34,7 +34,7 @@ class FilesConfig:
     slow_write: float = parameter(real(0.0, 0.0, 60.0, "s"), "Wall time over which a file grows; 0 = it appears whole.")
     limit: float = parameter(
         real(5e8, 0.0, 1e15, "B"),
-        "Maps in output_folder are removed, the oldest first, beyond this; 0 = all are kept.",
+        "Size of all maps in output_folder above which the oldest are removed; 0 = all are kept.",
     )
     part_name: str = "PDM30-37"
 

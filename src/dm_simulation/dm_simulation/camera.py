@@ -38,12 +38,12 @@ class CameraConfig:
         real(10.0, 0.0, 1e6, "m"), "Object distance in focus while the mirror is flat; 0 = infinity."
     )
     relay_magnification: float = parameter(
-        real(1.0, 0.01, 100.0), "Diameter of the beam on the mirror / of the entrance pupil."
+        real(1.0, 0.01, 100.0), "Diameter of the beam on the mirror / diameter of the entrance pupil."
     )
     wavelength: float = parameter(real(550e-9, 1e-7, 2e-5, "m"), "Wavelength of the images.")
     distances: Sequence[float] = live_parameter(
         reals([6.0, 15.0, 100.0], 0.0, 1e6, "m"),
-        "Distances of the objects, from left to right; 0 = infinity. Their number stays.",
+        "Distances of the objects, from left to right; 0 = infinity. Their number must not change.",
     )
     photons: float = parameter(
         real(5000.0, 1.0, 1e9), "Electrons per pixel at the mean grey level, which fixes the shot noise."

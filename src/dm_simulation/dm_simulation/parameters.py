@@ -20,12 +20,12 @@ from dm_simulation.mirror.piezo import DRAWN, PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 
 PARAMETERS = (
-    Parameter("seed", whole(1, 0, 2**31), "Fixes gains, initial figure and noise, and what else is drawn."),
+    Parameter("seed", whole(1, 0, 2**31), "Random seed of gains, initial figure, noise and all else that is drawn."),
     Parameter("mirror.name", text(FilesConfig.part_name), "Model of the mirror, as map files name it."),
     Parameter(
         "mirror.principle",
         text("piezo", choices=("piezo", "membrane")),
-        "A plate on piezo stacks (plate.*, piezo.*), or a membrane that electrodes pull (membrane.*).",
+        "A plate on piezo stacks (plate.*, piezo.*), or a membrane pulled by electrodes (membrane.*).",
     ),
     *parameters_of("plate.", PlateConfig),
     *parameters_of("piezo.", DRAWN),
@@ -51,7 +51,7 @@ PARAMETERS = (
     Parameter(
         "clock.speed",
         real(0.0, 0.0, 1e4),
-        "Publish /clock at this multiple of the wall clock, and live by it; 0 = no /clock, the node's own time.",
+        "Publish /clock at this multiple of wall time and run the bench by it; 0 = no /clock, run by the node's time.",
     ),
     Parameter("clock.period", real(0.002, 1e-4, 1.0, "s"), "Wall time between two messages on /clock."),
 )

@@ -71,9 +71,9 @@ class SearchConfig:
     fine_points: int = parameter(whole(7, 5, 1000), "Positions of each later sweep.")
     approach: float = parameter(
         real(1.0, 0.0, 1.0, "1/m"),
-        "Where the mirror's hysteresis is not known, or moves may err by two depths of focus, every sweep begins this "
-        "far below its first position, but not below the range: the whole range puts all sweeps on one branch, less is "
-        "quicker.",
+        "If the mirror's hysteresis is not known, or moves may err by two depths of focus, every sweep begins this far "
+        "below its first position, but not below the range: the whole range puts all sweeps on one hysteresis branch, "
+        "less is quicker.",
     )
     least_contrast: float = parameter(
         real(0.05, 0.0, 0.99), "Relative change of sharpness over the range below which there is nothing to focus on."

@@ -42,13 +42,13 @@ class TrackConfig:
 
     dither: float = parameter(
         real(0.5, 0.0, 10.0),
-        "Tracking: trials this far below and above the focus, in units of the finest step; 0 = stand still and watch.",
+        "Tracking: distance of the trials below and above the focus, in units of the finest step; 0 = only watch.",
     )
     drop: float = parameter(real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search.")
-    patience: int = parameter(whole(3, 1, 1000), "Tracking: images in a row that must have lost it.")
+    patience: int = parameter(whole(3, 1, 1000), "Tracking: number of images in a row that must show this loss.")
     wait: float = parameter(
         real(1.0, 0.0, 60.0, "s"),
-        "Tracking: how long the object may be hidden, by somebody who walks past, before a new search begins.",
+        "Tracking: how long the object may be hidden, for example by a passer-by, before a new search begins.",
     )
 
 

@@ -38,12 +38,12 @@ class AcquisitionSettings:
         name="file_pattern",
     )
     stable_time: float = parameter(
-        real(0.5, 0.02, 3600.0, "s"), "Time for which size and time of a file must stand still."
+        real(0.5, 0.02, 3600.0, "s"), "Time for which a file's size and modification time must not change."
     )
     trigger_command: Sequence[str] = parameter(
         texts([]),
         "Command that makes the instrument take a map, as an argument list (no shell); {path} in an argument is "
-        "replaced by the file in watch_folder it must write. Empty = measure waits for the next new file.",
+        "replaced by the path in watch_folder to write to. Empty = measure waits for the next new file.",
     )
     trigger_suffix: str = parameter(
         text(".datx"), "Ending of the file name that replaces {path}.", name="trigger_output_suffix"
@@ -51,12 +51,12 @@ class AcquisitionSettings:
     trigger_timeout: float = parameter(real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command.")
     trigger_exposure: float = parameter(
         real(0.5, 0.0, 1.0),
-        "When the map is exposed in the run of trigger_command, as a share of it: 0 = at its start.",
+        "When the map is exposed, as a fraction of the run time of trigger_command: 0 = at its start.",
     )
     file_delay: float = parameter(
         real(0.0, 0.0, 3600.0, "s"),
-        "Time from the start of an exposure to the end of its file, of an instrument that measures on by itself: a "
-        "file that ends sooner after a request shows the mirror as it was before, and the next one is waited for.",
+        "For instruments that measure continuously: time from the start of an exposure to the end of its file. A file "
+        "that ends sooner after a request shows the earlier shape, and measure waits for the next one.",
     )
 
     def __post_init__(self) -> None:

@@ -50,55 +50,55 @@ class IngestSettings:
     reference: SurfaceMap | None = None
     aperture_radius: float = live_parameter(
         real(0.0, 0.0, 1.0, "m"),
-        "Radius of the aperture; 0 = find the valid region of each map.",
+        "Radius of the aperture; 0 = find the aperture from the valid region of each map.",
         name="aperture.radius",
     )
     aperture_follow: bool = live_parameter(
         switch(False),
-        "Count aperture.centre_x and centre_y from the centre of the valid region, found anew in each map, where that "
-        "ends at the rim of the mirror or of a mask on it.",
+        "Measure aperture.centre_x and centre_y from the centre of the valid region, found anew in each map. For valid "
+        "regions that end at the rim of the mirror or of a mask on it.",
         name="aperture.follow",
     )
     valid_fraction_min: float = live_parameter(
         real(0.7, 0.0, 1.0),
-        "Least share of valid pixels in the aperture of a map that is published; maps with fewer are refused.",
+        "Smallest share of valid pixels in the aperture for a map to be published; maps with fewer are refused.",
         name="aperture.valid_fraction_min",
     )
     wavelength: float = live_parameter(
         real(0.0, 0.0, 2e-5, "m"),
-        "Wavelength of the instrument; maps of another are refused. 0 = any.",
+        "Wavelength of the instrument; maps of another wavelength are refused. 0 = any.",
         name="wavelength.expected",
     )
     wavelength_tolerance: float = live_parameter(
-        real(1e-9, 0.0, 1e-6, "m"), "Allowed difference from it.", name="wavelength.tolerance"
+        real(1e-9, 0.0, 1e-6, "m"), "Allowed deviation from wavelength.expected.", name="wavelength.tolerance"
     )
     pitch: float = live_parameter(
         real(0.0, 0.0, 0.1, "m"),
-        "Lateral resolution per pixel, as `./dm measure --reference-sphere METRES` finds it; files that tell one "
-        "that differs by more than 5 % are refused. 0 = as the files tell.",
+        "Lateral resolution per pixel, as found by `./dm measure --reference-sphere METRES`; files that state a value "
+        "more than 5 % off are refused. 0 = as stated in the file.",
     )
     # Retrace error and distortion are subtracted then; see `dm_calibration.optics.instrument`.
     retrace: tuple[float, ...] = parameter(
         reals([], -1.0, 1.0),
-        "Error that goes with tilt, 36 numbers, as `./dm instrument retrace FILES` finds them; empty = none.",
+        "Retrace error, proportional to tilt: 36 numbers from `./dm instrument retrace FILES`; empty = none.",
     )
     distortion: float = parameter(
         real(0.0, -0.1, 0.1),
-        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid MARKS.csv MAP` finds it.",
+        "Relative radial distortion at the edge of the map, from `./dm instrument grid MARKS.csv MAP`.",
     )
     instrument_error: float = live_parameter(
         real(0.0, 0.0, 1e-6, "m"),
-        "95 % bound on what is left of the instrument's error in any coefficient; results say what they are absolute "
-        "to by it. 0 = not known.",
+        "95 % bound on the remaining instrument error in any coefficient, for the absolute accuracy that results "
+        "state. 0 = not known.",
     )
     scale_error: float = live_parameter(
         real(0.0, 0.0, 0.1),
-        "95 % bound on the relative error of the lateral scale, for the same; 0 = not known.",
+        "95 % bound on the relative error of the lateral scale, for the absolute accuracy; 0 = not known.",
     )
     xyz_unit: str = live_parameter(
         text("", choices=("", *XYZ_UNITS)),
-        "Unit of the values in .xyz files, which do not tell it, and in .fits files without BUNIT; empty = refuse "
-        "them.",
+        "Unit of the values in .xyz files, which do not state it, and in .fits files without BUNIT; empty = refuse "
+        "such files.",
     )
     remove_piston_tilt: bool = live_parameter(
         switch(False), "Subtract piston and tilt from the published map; coefficients and samples keep them."

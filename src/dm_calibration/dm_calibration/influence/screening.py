@@ -36,20 +36,20 @@ class FitOptions:
     folds: int = 10
     epsilon: float | None = None
     valid_fraction_min: float = live_parameter(
-        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map that is fitted, whoever measured it."
+        real(0.5, 0.0, 1.0), "Smallest share of valid pixels in the aperture for a map to be fitted, from any source."
     )
     outlier_sigmas: float = live_parameter(
-        real(6.0, 3.0, 1e3), "Residual of a map, in robust sigmas above the median, beyond which it is dropped."
+        real(6.0, 3.0, 1e3), "Residual beyond which a map is dropped, in robust standard deviations above the median."
     )
     hysteresis_allowance: float = live_parameter(
         real(0.10, 0.0, 1.0),
-        "Share of their moves by which actuators may miss their mark (hysteresis: half the loop, whose width is 7-15 % "
-        "of the move) without the map being an outlier; 0 = they have none, and moves without a law of it are promised "
-        "what held-out maps show.",
+        "Share of its moves by which an actuator may miss its target through hysteresis (half the loop, whose width is "
+        "7-15 % of the move) without the map being an outlier. 0 = no hysteresis: without a hysteresis law, the error "
+        "promised for moves is then that of held-out maps.",
     )
-    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead below this many standard errors.")
+    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead if the response is below this many standard errors.")
     weak_sigmas: float = live_parameter(
-        real(10.0, 0.0, 1e3), "Weak below this many standard errors, where they are twice those of the other actuators."
+        real(10.0, 0.0, 1e3), "Weak below this many standard errors, if the relative error exceeds twice the median."
     )
     weak_share: float = live_parameter(real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.")
 

@@ -25,7 +25,7 @@ class Orientation:
     flip_y: bool = live_parameter(switch(False), "Exchange top and bottom of the instrument's picture.")
     rotate_deg: float = live_parameter(
         real(0.0, -360.0, 360.0, "deg"),
-        "Then rotate it counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
+        "Rotate the flipped picture counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
     )
 
     def apply(self, sag: NDArray[np.float64]) -> NDArray[np.float64]:

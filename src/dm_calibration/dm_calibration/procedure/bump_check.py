@@ -37,11 +37,11 @@ class BumpOptions:
     )
     shift_max: float = live_parameter(
         real(1e-4, 0.0, 1e-2, "m"),
-        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not checked.",
+        "Largest shift of the aperture in the map between two reference frames, on the mirror; 0 = not checked.",
     )
     figure_max: float = live_parameter(
         real(50e-9, 0.0, 1e-3, "m"),
-        "Largest change of the rms figure between two reference frames, beyond what twice `hysteresis_allowance` "
+        "Largest rms change of the figure between two reference frames, beyond what twice `hysteresis_allowance` "
         "explains; 0 = not checked.",
     )
     hysteresis_allowance: float = 0.10

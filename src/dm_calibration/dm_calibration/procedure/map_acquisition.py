@@ -33,7 +33,7 @@ class ProcedureOptions:
 
     measure_retries: int = live_parameter(whole(1, 0, 20), "Further tries after a map that failed.")
     failures_max: int = live_parameter(
-        whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up."
+        whole(3, 1, 1000), "Number of shapes in a row without a map after which a run is given up."
     )
     maps_per_state: int = 1
     aperture_tolerance: float = APERTURE_TOLERANCE

@@ -84,13 +84,13 @@ class PlanOptions:
     poke_amplitude: float = live_parameter(real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised.")
     reference_every: int = live_parameter(
         whole(10, 1, 1000),
-        "Steps between two reference frames of pokes and surfaces; a hysteresis run has one every 100.",
+        "Steps between two reference frames in runs of pokes and surfaces; hysteresis runs have one every 100.",
     )
     surfaces: Sequence[str] = ()
     degauss: bool = True
     hysteresis_maps: int = live_parameter(
         whole(200, MAPS_MIN, MAPS_MAX),
-        "Commands of a hysteresis plan, at least two for each actuator; more, less noise.",
+        "Commands of a hysteresis plan, at least two for each actuator; more of them reduce the noise.",
     )
     until: float = 0.0
 

@@ -30,18 +30,18 @@ class UpdateOptions:
 
     surprise_max: float = live_parameter(
         real(3.0, 1.0, 100.0),
-        "A map that differs from its prediction by more than this times the expected difference is not taken.",
+        "A map that differs from its prediction by more than this times the expected difference is not used.",
     )
     surprises_max: int = live_parameter(
-        whole(3, 1, 1000), "Maps in a row that differ so much after which the mirror counts as changed."
+        whole(3, 1, 1000), "Number of such maps in a row after which the mirror counts as changed."
     )
     gain_rate: float = parameter(
         real(3e-4, 0.0, 1.0),
-        "Expected relative drift of a gain in one day; it grows with the root of time. 0 = the gains stay.",
+        "Expected relative drift of a gain in one day; grows with the square root of time. 0 = gains do not drift.",
     )
     figure_rate: float = parameter(
         real(1e-9, 0.0, 1e-6, "m"),
-        "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
+        "Expected rms drift of the figure in one day; grows with the square root of time. 0 = it does not drift.",
     )
     valid_fraction_min: float = 0.5
     aperture_tolerance: float = APERTURE_TOLERANCE

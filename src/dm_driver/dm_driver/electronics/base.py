@@ -58,7 +58,7 @@ class ElectronicsSettings:
     port: int = parameter(whole(1234, 1, 65535), "EDAC40: TCP or UDP port.")
     discovery_port: int = parameter(
         whole(0, 0, 65535),
-        "EDAC40 over UDP: port of the discovery (30303 on real units) to check the link with; 0 = not checked.",
+        "EDAC40 over UDP: discovery port (30303 on real units) by which the link is checked; 0 = not checked.",
     )
     serial_port: str = parameter(
         text("", path=True), "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0."

@@ -37,7 +37,7 @@ class FrameFormat:
     header: str = parameter(text(""), "Bytes before the words, hexadecimal, for example 'A5 5A'.")
     terminator: str = parameter(text(""), "Bytes after the check sum, hexadecimal.")
     channel_order: Sequence[int] = parameter(
-        wholes([], 0, 4095), "Connector channels, from 0, in the order of their words; empty = 0, 1, 2, ..."
+        wholes([], 0, 4095), "Connector channels (from 0) in the order in which they are sent; empty = 0, 1, 2, ..."
     )
     word_bits: int = parameter(
         whole(0, 0, MOST_WORD_BITS),
@@ -52,16 +52,16 @@ class FrameFormat:
         whole(0, -(2**31), 2**32), "word = offset + scale * code; negative words in two's complement."
     )
     checksum: str = parameter(text("none", choices=tuple(CHECK_SUMS)), "Check sum.")
-    checksum_covers_header: bool = parameter(switch(True), "The check sum counts the header.")
+    checksum_covers_header: bool = parameter(switch(True), "The check sum includes the header.")
     checksum_byte_order: Literal["big", "little"] = parameter(
-        text("big", choices=BYTE_ORDERS), "Of check sums of two bytes."
+        text("big", choices=BYTE_ORDERS), "Byte order of check sums of two bytes."
     )
     opening: str = parameter(text(""), "Bytes sent once after opening, hexadecimal.")
     reply: str = parameter(
         text(""),
-        "What the unit answers to every frame within electronics.timeout, hexadecimal; empty = it does not answer.",
+        "Reply of the unit to every frame, within electronics.timeout, hexadecimal; empty = it does not reply.",
     )
-    baud_rate: int = parameter(whole(115200, 50, 10_000_000, "bit/s"), "Of the line.")
+    baud_rate: int = parameter(whole(115200, 50, 10_000_000, "bit/s"), "Baud rate of the line.")
     parity: str = parameter(text("none", choices=PARITIES), "Parity bit.")
     stop_bits: int = parameter(whole(1, 1, 2), "Stop bits.")
     frame_rate: float = parameter(real(0.0, 0.0, 1e6, "Hz"), "Most frames per second; 0 = as many as the line carries.")

@@ -32,9 +32,9 @@ class DriveConfig:
         whole(frames.CHANNELS, 1, 4096), "Channels at the connector; EDAC40 and USB DAC-40 have 40."
     )
     dac_volts_at_zero: float = parameter(
-        real(0.0, -100.0, 100.0, "V"), "DAC output at code 0, as the unit's NVRAM has it."
+        real(0.0, -100.0, 100.0, "V"), "DAC output at code 0, as stored in the unit's NVRAM."
     )
-    dac_volts_at_full: float = parameter(real(5.0, -100.0, 100.0, "V"), "DAC output at full code, likewise.")
+    dac_volts_at_full: float = parameter(real(5.0, -100.0, 100.0, "V"), "DAC output at full-scale code, likewise.")
     amplifier_gain: float = parameter(real(80.0, -1e4, 1e4), "Actuator V per DAC V.")
     amplifier_min: float = parameter(real(0.0, -1e4, 1e4, "V"), "Lowest actuator volts, where the amplifier saturates.")
     amplifier_max: float = parameter(real(400.0, -1e4, 1e4, "V"), "Highest actuator volts.")

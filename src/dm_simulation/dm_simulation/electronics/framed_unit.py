@@ -35,7 +35,7 @@ class FramedConfig:
     opening: str = parameter(text(""), "Bytes that may come before a frame and are ignored, hexadecimal.")
     reply: str = parameter(text(""), "Answer to every frame, hexadecimal.")
     channel_order: tuple[int, ...] = parameter(
-        wholes([], 0, 4095), "Channels, from 0, in the order of their words; empty = 0, 1, 2, ..."
+        wholes([], 0, 4095), "Channels (from 0) in the order in which they are sent; empty = 0, 1, 2, ..."
     )
     word_bits: int = parameter(whole(0, 0, 32), "Bits of a word, without gaps; 0 = bits rounded up to whole bytes.")
     byte_order: Literal["big", "little"] = parameter(
@@ -44,8 +44,8 @@ class FramedConfig:
     scale: int = parameter(whole(1, -(2**31), 2**31), "word = offset + scale * code.")
     offset: int = parameter(whole(0, -(2**31), 2**32), "word = offset + scale * code.")
     checksum: str = parameter(text("none", choices=tuple(CHECK_LENGTH)), "Check sum.")
-    checksum_covers_header: bool = parameter(switch(True), "It counts the header.")
-    checksum_byte_order: Literal["big", "little"] = parameter(text("big", choices=BYTE_ORDERS), "Of two bytes.")
+    checksum_covers_header: bool = parameter(switch(True), "The check sum includes the header.")
+    checksum_byte_order: Literal["big", "little"] = parameter(text("big", choices=BYTE_ORDERS), "Of two-byte sums.")
 
 
 def check_value(kind: str, data: bytes) -> int:

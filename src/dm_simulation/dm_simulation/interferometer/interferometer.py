@@ -36,7 +36,7 @@ class InterferometerConfig:
     wavelength: float = parameter(real(WAVELENGTH, 1e-7, 2e-5, "m"), "Wavelength.")
     figure_rms: float = parameter(
         real(40e-9, 0.0, 1e-5, "m"),
-        "Initial figure of the unpowered mirror, orders 2-12 over it, by the seed: rms inside the field.",
+        "Rms, inside the field, of the unpowered mirror's initial figure: orders 2-12 over the mirror, by the seed.",
     )
     pixel_noise: float = parameter(real(1e-9, 0.0, 1e-6, "m"), "White noise per pixel, rms.")
     low_order_noise: float = parameter(
@@ -44,50 +44,50 @@ class InterferometerConfig:
         "Noise of all Zernike terms of orders 2-5 together, rms over the field.",
     )
     noise_time: float = parameter(
-        real(0.0, 0.0, 1e5, "s"), "How long it lasts: its correlation from map to map falls to 1/e; 0 = not at all."
+        real(0.0, 0.0, 1e5, "s"), "Correlation time of low_order_noise from map to map (1/e); 0 = not correlated."
     )
     piston_spread: float = parameter(real(200e-9, 0.0, 1e-4, "m"), "Standard deviation of piston between maps.")
     tilt_spread: float = parameter(
-        real(300e-9, 0.0, 1e-4, "m"), "Standard deviation of the edge sag by each tilt between maps."
+        real(300e-9, 0.0, 1e-4, "m"), "Standard deviation, between maps, of the edge sag due to each tilt."
     )
     instrument_error: float = parameter(
         real(0.0, 0.0, 1e-5, "m"),
-        "What the instrument adds to every map, rms, orders 2-12 over the field, by the seed; a map of it alone lies "
-        "in output_folder/reference/flat.datx.",
+        "Rms error that the instrument adds to every map, orders 2-12 over the field, by the seed; a map of it alone "
+        "is output_folder/reference/flat.datx.",
     )
     retrace: float = parameter(
         real(0.0, 0.0, 0.1),
-        "What it adds for each m of edge sag by tilt, rms m, orders 2-5, by the seed, for x and for y.",
+        "Retrace error, rms m per m of edge sag due to tilt in x or in y, orders 2-5, by the seed.",
     )
     distortion: float = parameter(
         real(0.0, -0.05, 0.05),
-        "Radial distortion, by the cube of the distance: what lies at the edge is seen further from the centre by this "
-        "share.",
+        "Radial distortion, with the cube of the distance from the centre: a point at the edge is seen further out by "
+        "this share.",
     )
     vibration: float = parameter(
         real(0.0, 0.0, 1e-7, "m"),
-        "Ripples at twice the frequency of the fringes, whose size differs from map to map: median amplitude.",
+        "Median amplitude of ripples at twice the fringe frequency; the amplitude differs from map to map.",
     )
-    phase_steps: float = parameter(real(0.0, 0.0, 20.0), "Mean number of discs per map that stand a whole fringe off.")
+    phase_steps: float = parameter(real(0.0, 0.0, 20.0), "Mean number of discs per map that are off by a whole fringe.")
     mask_diameter: float = parameter(
-        real(0.0, 0.0, 1.0, "m"), "Of a mask on the mirror, beyond which nothing is seen; 0 = no mask."
+        real(0.0, 0.0, 1.0, "m"), "Diameter of a mask on the mirror that hides all beyond it; 0 = no mask."
     )
     specks: int = parameter(whole(400, 0, 1_000_000), "Mean number of dropped pixels per map.")
     blobs: int = parameter(
-        whole(6, 0, 1000), "Dropped discs per map, of 3 to 16 pixels radius where the camera has 944."
+        whole(6, 0, 1000), "Dropped discs per map, 3 to 16 pixels in radius on a camera of 944 pixels."
     )
     mount_angle: float = parameter(
         real(0.0, -7.0, 7.0, "rad"),
-        "How the mirror is mounted in the field of view: turned anticlockwise by this, after ...",
+        "Mounting of the mirror in the field of view: turned anticlockwise by this angle.",
     )
-    mount_mirrored: bool = parameter(switch(False), "... it was mirrored left-right.")
-    mount_x: float = parameter(real(0.0, -0.1, 0.1, "m"), "Its centre in the field, x.")
-    mount_y: float = parameter(real(0.0, -0.1, 0.1, "m"), "Its centre in the field, y.")
+    mount_mirrored: bool = parameter(switch(False), "Mounting: mirrored left-right, before the turn.")
+    mount_x: float = parameter(real(0.0, -0.1, 0.1, "m"), "Centre of the mirror in the field, x.")
+    mount_y: float = parameter(real(0.0, -0.1, 0.1, "m"), "Centre of the mirror in the field, y.")
     mount_scale: float = parameter(
-        real(1.0, 0.5, 2.0), "Lengths as the instrument sees them / true ones: error of its lateral scale."
+        real(1.0, 0.5, 2.0), "Error of the lateral scale: lengths as the instrument sees them / true lengths."
     )
-    flip_x: bool = parameter(switch(False), "Picture mirrored left-right, after turning.")
-    flip_y: bool = parameter(switch(False), "Picture mirrored upside down, after turning.")
+    flip_x: bool = parameter(switch(False), "Picture mirrored left-right, after rotate_deg.")
+    flip_y: bool = parameter(switch(False), "Picture mirrored upside down, after rotate_deg.")
     rotate_deg: int = parameter(whole(0, 0, 270, "deg"), "Picture turned anticlockwise by 0, 90, 180 or 270.")
 
 

@@ -34,15 +34,15 @@ class MembraneConfig:
 
     diameter: float = parameter(real(0.015, 1e-3, 1.0, "m"), "Diameter inside the frame.")
     tension: float = parameter(real(60.0, 1e-3, 1e5, "N/m"), "Tension of the membrane.")
-    gap: float = parameter(real(100e-6, 1e-6, 1e-2, "m"), "From the electrodes to the flat membrane.")
+    gap: float = parameter(real(100e-6, 1e-6, 1e-2, "m"), "Distance from the electrodes to the flat membrane.")
     actuators: int = parameter(
-        whole(37, 7, 1000), "Electrodes of the hexagonal pattern: full rings, numbered as stacks."
+        whole(37, 7, 1000), "Electrodes of the hexagonal pattern: full rings, numbered like the stacks."
     )
-    pitch: float = parameter(real(1.8e-3, 1e-4, 0.1, "m"), "Distance of neighbouring electrodes.")
+    pitch: float = parameter(real(1.8e-3, 1e-4, 0.1, "m"), "Distance between neighbouring electrodes.")
     electrode_diameter: float = parameter(real(1.7e-3, 1e-4, 0.1, "m"), "Diameter of an electrode.")
-    gain_spread: float = parameter(real(0.03, 0.0, 0.3), "Standard deviation of relative pulls, cut at three of them.")
-    drift: float = parameter(real(0.0, 0.0, 1e-5, "m"), "Deflection that the zero drifts by in a long time.")
-    drift_time: float = parameter(real(3600.0, 1.0, 1e7, "s"), "Time of 63 % of that drift.")
+    gain_spread: float = parameter(real(0.03, 0.0, 0.3), "Standard deviation of relative pulls, cut off at 3 sigma.")
+    drift: float = parameter(real(0.0, 0.0, 1e-5, "m"), "Deflection by which the zero drifts in a long time.")
+    drift_time: float = parameter(real(3600.0, 1.0, 1e7, "s"), "Time in which 63 % of that drift happens.")
     order: int = parameter(whole(36, 12, 60), "Degree of the polynomials of the solution.")
 
 

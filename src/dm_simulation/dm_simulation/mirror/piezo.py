@@ -32,31 +32,31 @@ class PiezoConfig:
     )
     hysteresis: float = parameter(
         real(0.10, 0.0, 0.3),
-        "Widest loop opening over the full stroke; of drawn laws at most 0.8 of what each can have.",
+        "Largest opening of the full loop, as a fraction of the stroke; drawn laws: at most 0.8 of what each can have.",
     )
     hysteresis_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative loop openings.")
     creep: float = parameter(real(0.01, 0.0, 0.1), "Creep of a step per decade of time, as a fraction of the step.")
     creep_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative creep.")
     creep_fastest: float = parameter(
-        real(0.1, 1e-3, 1e6, "s"), "Time constant of the fastest of the first-order elements of creep."
+        real(0.1, 1e-3, 1e6, "s"), "Time constant of the fastest first-order creep element."
     )
-    creep_slowest: float = parameter(real(1e5, 1e-3, 1e7, "s"), "Time constant of the slowest element of creep.")
+    creep_slowest: float = parameter(real(1e5, 1e-3, 1e7, "s"), "Time constant of the slowest creep element.")
     creep_per_decade: int = parameter(
-        whole(3, 1, 10), "Elements per decade of time; the sum of three follows log t to 1 % of the creep rate."
+        whole(3, 1, 10), "Creep elements per decade of time; the sum of three follows log t to 1 % of the creep rate."
     )
-    spectrum_spread: float = parameter(real(0.0, 0.0, 1.0), "Spread of elements, common to all stacks, as a logarithm.")
+    spectrum_spread: float = parameter(real(0.0, 0.0, 1.0), "Spread of creep elements' log weights, common to stacks.")
     creep_position: float = parameter(real(0.0, -0.5, 0.5), "Relative change of creep from mid range to signal 1.")
     rate_dependence: float = parameter(real(0.0, 0.0, 0.1), "Widening of loops per decade of speed.")
     crosstalk: float = parameter(
-        real(0.0, 0.0, 0.1), "Share of the next channel's signal that an actuator takes up, standard deviation."
+        real(0.0, 0.0, 0.1), "Share of the next actuator's signal that an actuator picks up, standard deviation."
     )
     stiffening: float = parameter(
-        real(0.0, 0.0, 0.2), "Share of half the stroke lost at signals -1 and +1, in squares."
+        real(0.0, 0.0, 0.2), "Share of half the stroke lost at signals -1 and +1; grows as displacement squared."
     )
     drift: float = parameter(real(0.0, 0.0, 1e-7, "m"), "Drift of the bases over a day.")
-    swing: float = parameter(real(0.0, 0.0, 20.0, "K"), "Swing of the temperature over a day, about 20 degC.")
+    swing: float = parameter(real(0.0, 0.0, 20.0, "K"), "Amplitude of the daily temperature cycle about 20 degC.")
     warm_gain: float = parameter(real(0.0, -0.01, 0.01, "1/K"), "Relative change of all gains per kelvin.")
-    warm_base: float = parameter(real(0.0, 0.0, 1e-7, "m/K"), "What bases go by per kelvin, standard deviation.")
+    warm_base: float = parameter(real(0.0, 0.0, 1e-7, "m/K"), "Standard deviation of the bases' shift per kelvin.")
 
 
 #: Stacks that differ from each other in law, loop and creep.

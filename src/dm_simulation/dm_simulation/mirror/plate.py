@@ -28,7 +28,7 @@ class PlateConfig:
         whole(37, 7, 1000),
         "Actuators of the hexagonal pattern: 1 in the centre, then rings of 6, 12, 18, ..., numbered in angle.",
     )
-    pitch: float = parameter(real(4.3e-3, 1e-4, 0.1, "m"), "Distance of neighbouring actuators.")
+    pitch: float = parameter(real(4.3e-3, 1e-4, 0.1, "m"), "Distance between neighbouring actuators.")
     start_angle: float = parameter(
         real(0.0, -7.0, 7.0, "rad"), "Angle of actuator 2, and of the first in every other ring, from the x axis."
     )
