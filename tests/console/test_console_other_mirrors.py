@@ -66,16 +66,27 @@ CONTROLS = {"button", "textbox", "spinbutton", "combobox", "slider", "radio", "s
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, StandIn, str]]:
-    """A page that was opened before the nodes were there; then they come."""
+def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, str]]:
+    """ROS domain and address of a console that is there before the nodes."""
     with own_domain() as domain, served(domain, tmp_path_factory.mktemp("other")) as address:
-        browser = Browser(address, *DESKTOP)
-        try:
-            browser.wait_for("No node of the suite is heard.")
-            with Observer(domain, "stand_in") as observer:
-                yield browser, StandIn(observer.node, X, Y), address
-        finally:
-            browser.driver.quit()
+        yield domain, address
+
+
+@pytest.fixture(scope="module")
+def opened(console: tuple[int, str]) -> Iterator[Browser]:
+    """Its page; the tests run in order and find what the ones before left."""
+    browser = Browser(console[1], *PHONE)
+    yield browser
+    browser.driver.quit()
+
+
+@pytest.fixture(scope="module")
+def bench(console: tuple[int, str], opened: Browser) -> Iterator[tuple[Browser, StandIn]]:
+    """That page, to which the nodes come."""
+    opened.resize(*DESKTOP)
+    opened.wait_for("No node of the suite is heard.")
+    with Observer(console[0], "stand_in") as observer:
+        yield opened, StandIn(observer.node, X, Y)
 
 
 def named_nodes(browser: Browser) -> list[tuple[str, str]]:
@@ -86,7 +97,12 @@ def named_nodes(browser: Browser) -> list[tuple[str, str]]:
     return [(role, name) for role, name in told if role in CONTROLS]
 
 
-def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn, str]) -> None:
+def test_without_nodes_the_page_says_what_is_missing(opened: Browser) -> None:
+    opened.wait_for("No node of the suite is heard. Start them (./dm up)")
+    assert "driver: not heard" in opened.text
+
+
+def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     page.wait_for("driver: active")
     page.wait_for("c19: calibrated")
@@ -95,7 +111,7 @@ def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn
 
 
 def test_nineteen_actuators_stand_where_the_driver_says(
-    bench: tuple[Browser, StandIn, str], tmp_path_factory: pytest.TempPathFactory
+    bench: tuple[Browser, StandIn], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     page = bench[0]
     (words,) = wait_until(lambda: page.pictures("command map of"), 60, "the map")
@@ -115,8 +131,8 @@ def test_nineteen_actuators_stand_where_the_driver_says(
     page.shoot(shots_folder(tmp_path_factory.mktemp("shots")) / "console-19.png")
 
 
-def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, StandIn, str]) -> None:
-    page, stand_in, _ = bench
+def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, StandIn]) -> None:
+    page, stand_in = bench
     page.find("Map after a poke", "*").click()
     page.enter("Number", "19")
     page.press("Poke")
@@ -126,7 +142,7 @@ def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, Stan
     wait_until(lambda: stand_in.signals == [0.0] * 19, 60, "the release")
 
 
-def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn, str]) -> None:
+def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     page.wait_for("Predicted residual")
     before = page.find("Move", "button").rect
@@ -136,7 +152,7 @@ def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn, str]) 
     page.enter("Curvature, 1/m", "0.0")
 
 
-def test_the_slider_takes_the_mouse(bench: tuple[Browser, StandIn, str]) -> None:
+def test_the_slider_takes_the_mouse(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     page.wait_for("Reachable -0.0500 to +0.0500 1/m")
     slider, field = page.find("Curvature in 1 per metre", "div"), page.find("Curvature, 1/m", "input")
@@ -149,7 +165,7 @@ def test_the_slider_takes_the_mouse(bench: tuple[Browser, StandIn, str]) -> None
     page.enter("Curvature, 1/m", "0.0")
 
 
-def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
+def test_every_control_has_a_name(bench: tuple[Browser, StandIn]) -> None:
     for title in DETAILS:
         bench[0].unfold(title)
     told = named_nodes(bench[0])
@@ -157,7 +173,7 @@ def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
     assert [role for role, name in told if not name.strip()] == []
 
 
-def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tuple[Browser, StandIn, str]) -> None:
+def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tuple[Browser, StandIn]) -> None:
     find = bench[0].driver.find_element
     assert find(By.CSS_SELECTOR, ".failures").get_attribute("aria-live") == "assertive"
     assert find(By.CSS_SELECTOR, ".failures").get_attribute("role") == "alert"
@@ -171,7 +187,7 @@ def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tup
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_all_text_stands_out_from_its_ground(
-    bench: tuple[Browser, StandIn, str], size: tuple[int, int], scheme: str, tmp_path_factory: pytest.TempPathFactory
+    bench: tuple[Browser, StandIn], size: tuple[int, int], scheme: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     page = bench[0]
     page.resize(*size)
@@ -201,7 +217,7 @@ def test_all_text_stands_out_from_its_ground(
 @needs_axe
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_axe_finds_nothing(bench: tuple[Browser, StandIn, str], size: tuple[int, int], scheme: str) -> None:
+def test_axe_finds_nothing(bench: tuple[Browser, StandIn], size: tuple[int, int], scheme: str) -> None:
     page = bench[0]
     page.resize(*size)
     page.prefer(scheme)
@@ -213,7 +229,7 @@ def test_axe_finds_nothing(bench: tuple[Browser, StandIn, str], size: tuple[int,
     assert "\n".join(found) == ""
 
 
-def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Browser, StandIn, str]) -> None:
+def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     for title in DETAILS:
         page.unfold(title)
@@ -233,7 +249,7 @@ def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Brows
     assert len(names) > 25
 
 
-def test_the_phone_page_needs_no_scrolling_sideways(bench: tuple[Browser, StandIn, str]) -> None:
+def test_the_phone_page_needs_no_scrolling_sideways(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     page.resize(*PHONE)
     width, inner = page.driver.execute_script("return [document.documentElement.scrollWidth, innerWidth]")

@@ -24,6 +24,7 @@ from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shot
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
 from fault_injection.rigs.forked_node import ForkedSuite
+from studies.quick_trigger import quick_trigger
 from support import wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
@@ -45,6 +46,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningConsole]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+    config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
+    config["calibration"]["write_report"] = False
     with own_domain() as domain, served(domain, folder) as address:
         bench = RunningConsole(config, folder, domain, address, ForkedSuite(config, folder, domain).__enter__())
         try:
@@ -185,22 +188,11 @@ def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Runn
     page.wait_for("Measure: rms", 60)
 
 
-def test_without_nodes_the_page_says_what_is_missing(domain: int, tmp_path: Path) -> None:
-    with served(domain, tmp_path) as address:
-        browser = Browser(address, *PHONE)
-        try:
-            browser.wait_for("No node of the suite is heard. Start them (./dm up)")
-            assert "driver: not heard" in browser.text
-        finally:
-            browser.driver.quit()
-
-
-def test_another_host_name_is_refused(domain: int, tmp_path: Path) -> None:
-    with served(domain, tmp_path) as address:
-        request = urllib.request.Request(address, headers={"Host": "mirror.example"})
-        with pytest.raises(urllib.error.HTTPError) as refusal:
-            urllib.request.urlopen(request, timeout=10)
-        assert refusal.value.code == 400
+def test_another_host_name_is_refused(bench: RunningConsole) -> None:
+    request = urllib.request.Request(bench.address, headers={"Host": "mirror.example"})
+    with pytest.raises(urllib.error.HTTPError) as refusal:
+        urllib.request.urlopen(request, timeout=10)
+    assert refusal.value.code == 400
 
 
 def test_a_port_in_use_is_named(domain: int) -> None:

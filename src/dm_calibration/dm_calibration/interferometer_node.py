@@ -31,7 +31,6 @@ from dm_calibration.interferometer_parameters import PARAMETERS, configure
 from dm_calibration.map_files import MapFileError, SurfaceMap
 from dm_calibration.map_files.datx_structure import as_text
 from dm_calibration.optics.orientation import Orientation
-from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.messages import stamp_ns
@@ -39,7 +38,11 @@ from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService
-from dm_common.values import from_values
+from dm_common.values import Fields, from_values, real, text
+
+#: What the fields of its requests may be.
+MEASURE = Fields({"label": text(""), "timeout": real(0.0, 1e-3, 86400.0, "s", zero="as configured")})
+INGEST_FILE = Fields({"path": text("")})
 
 
 class InterferometerNode(ManagedNode):

@@ -54,5 +54,3 @@ RECIPE = Fields(
         "rms": real(0.0, 0.0, 1.0, "m"),
     }
 )
-MEASURE = Fields({"label": text(""), "timeout": real(0.0, 1e-3, 86400.0, "s", zero=_CONFIGURED)})
-INGEST_FILE = Fields({"path": text("")})

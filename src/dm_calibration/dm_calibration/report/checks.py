@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import theilslopes
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_parameters import JUDGED_BY
@@ -37,6 +36,8 @@ def valid_until(
     stale = max([measured_s, *agreed]) + values["updates.stale_after"]
     if len(checks) < TREND_MIN or checks[-1].time - checks[0].time < TREND_SPAN_S:
         return stale, "too few checks to see a trend; a check that agrees puts it off"
+    from scipy.stats import theilslopes  # here: it takes as long to import as half of a report's other libraries
+
     time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
     slope, level, low, _high = theilslopes(error, time - time[0], 0.9)
     per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"

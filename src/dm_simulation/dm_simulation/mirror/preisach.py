@@ -48,26 +48,29 @@ class PreisachOperator:
 
     def move(self, u: Array) -> Array:
         """Go monotonically from the last signals to `u` (N,), clipped to +-EDGE; returns m (N,)."""
-        u = np.clip(u, -EDGE, EDGE)
+        u = np.minimum(np.maximum(u, -EDGE), EDGE)
         way = np.sign(u - self._u)
+        moved, rows = way != 0, np.arange(len(u))
         turned = way * self._way < 0
         first = turned & (self._depth == 0)
         if first.any():
             self._push(first, -self._u, self._initial(-self._u))
         if turned.any():
             self._push(turned, self._u, self._m)
-        # A move wipes out the turning points of its own direction that it passes, each with the one before it.
-        place = np.arange(self._turn.shape[1])
-        left = self._depth[:, None] - place
-        passed = (left >= 2) & (left % 2 == 0) & ((self._turn - u[:, None]) * way[:, None] <= 0) & (way != 0)[:, None]
-        self._depth -= 2 * np.count_nonzero(passed, axis=1)
-        self._depth[self._depth == 1] = 0  # only the mirror image is left: demagnetised state again
-        branch = np.maximum(self._depth - 1, 0)[:, None]
-        start = np.take_along_axis(self._turn, branch, axis=1)[:, 0]
-        m = np.take_along_axis(self._height, branch, axis=1)[:, 0] + way * self._switched(u, start)
-        m = np.where(self._depth == 0, self._initial(u), m)
-        self._m = np.where(way == 0, self._m, m)
-        self._way = np.where(way == 0, self._way, way)
+        # A move wipes out the turning points of its own direction that it passes, each with the one before it. The
+        # last one is passed first.
+        last = self._turn[rows, np.maximum(self._depth - 2, 0)]
+        if ((self._depth >= 2) & moved & ((last - u) * way <= 0)).any():
+            left = self._depth[:, None] - np.arange(self._turn.shape[1])
+            passed = (left >= 2) & (left % 2 == 0) & ((self._turn - u[:, None]) * way[:, None] <= 0) & moved[:, None]
+            self._depth -= 2 * np.count_nonzero(passed, axis=1)
+            self._depth[self._depth == 1] = 0  # only the mirror image is left: demagnetised state again
+        branch = np.maximum(self._depth - 1, 0)
+        m = self._height[rows, branch] + way * self._switched(u, self._turn[rows, branch])
+        if not self._depth.all():
+            m = np.where(self._depth == 0, self._initial(u), m)
+        self._m = np.where(moved, m, self._m)
+        self._way = np.where(moved, way, self._way)
         self._u = u
         return self._m
 
@@ -84,9 +87,9 @@ class PreisachOperator:
         """The Everett function for moves between two signals (N,)."""
         high, low = np.maximum(one, other), np.minimum(one, other)
         (i, x), (j, y) = _place(high), _place(low)
-        row, table = self._row, self._table
-        below = (1 - y) * table[row, i, j] + y * table[row, i, j + 1]
-        above = (1 - y) * table[row, i + 1, j] + y * table[row, i + 1, j + 1]
+        at, table = (self._row * POINTS + i) * POINTS + j, self._table.ravel()
+        below = (1 - y) * table[at] + y * table[at + 1]
+        above = (1 - y) * table[at + POINTS] + y * table[at + POINTS + 1]
         return (high - low) ** 2 * ((1 - x) * below + x * above)
 
     def _initial(self, u: Array) -> Array:

@@ -3,7 +3,7 @@
 from nicegui import app, ui
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from dm_tools.console import style
+from dm_tools.console import HOST, style
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.console.session import Session
 from dm_tools.console.surface_view import SurfaceView
@@ -13,8 +13,7 @@ from dm_tools.console.widgets.focus import FocusCard
 from dm_tools.console.widgets.messages import DiagnosticsCard, Header, LogCard
 from dm_tools.console.widgets.surfaces import SurfaceCard, ZernikeCard
 
-#: Loopback only. The check of host names also keeps foreign web sites from reaching the mirror through the browser.
-HOST = "127.0.0.1"
+#: The check of host names also keeps foreign web sites from reaching the mirror through the browser.
 HOST_NAMES = [HOST, "localhost"]
 REFRESH_S = 0.3
 #: A page that was disconnected for longer is reloaded and loses typed values, s; long enough for a sleeping phone.

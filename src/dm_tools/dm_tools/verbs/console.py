@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from dm_tools.console import HOST
 from dm_tools.output import NamespaceOption
 from dm_tools.output import console as terminal
 
@@ -20,21 +21,21 @@ def console(
     Talks to the running nodes (`dm up`) through ROS only, and to browsers on this machine only. Ctrl-C ends it; the
     mirror keeps its shape.
     """
-    from dm_tools.console.console_node import ConsoleNode
-
-    try:
-        from dm_tools.console.page import HOST, serve
-    except ModuleNotFoundError as error:
-        if error.name != "nicegui":
-            raise
-        raise RuntimeError("the console needs NiceGUI: `pip install nicegui`, see docs/install.md") from error
-
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
         except OSError as error:
             raise RuntimeError(f"--port {port}: {error.strerror}; name another, 1 to 65535") from error
+
+    from dm_tools.console.console_node import ConsoleNode
+
+    try:
+        from dm_tools.console.page import serve
+    except ModuleNotFoundError as error:
+        if error.name != "nicegui":
+            raise
+        raise RuntimeError("the console needs NiceGUI: `pip install nicegui`, see docs/install.md") from error
     ros = ConsoleNode(namespace)
     try:
         terminal.print(f"console: http://{HOST}:{port}   (Ctrl-C ends it)")
