@@ -346,6 +346,16 @@ def test_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor_bench.watched_folder(tmp_path, written=False, made=False) is None
 
 
+def test_what_would_end_the_first_run_is_told() -> None:
+    config = {"pdm_driver": {"mirror.working_aperture_diameter": 0.022}, "interferometer": {"aperture.radius": 0.010}}
+    finding = doctor_bench.aperture_fits(config)
+    assert finding is not None and "the working aperture of the mirror has a radius of 0.011 m" in finding.problem
+    assert doctor_bench.aperture_fits(config | {"interferometer": {"aperture.radius": 0.0}}) is None
+    finding = doctor_bench.trigger_program(["pyhton3", "{path}"])
+    assert finding is not None and "trigger_command = 'pyhton3', ...: no such program" in finding.problem
+    assert doctor_bench.trigger_program([sys.executable]) is None and doctor_bench.trigger_program([]) is None
+
+
 def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_machine, "DISK_MIN", 0.0)
     assert doctor_machine.disk(tmp_path) is None

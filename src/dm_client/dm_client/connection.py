@@ -70,6 +70,8 @@ def full_namespace(namespace: str) -> str:
     place = f"/{namespace.strip('/')}"
     try:
         validate_namespace(place)
+        if "__" in place:  # rclpy takes it here, and raises an error of its parser later
+            raise InvalidNamespaceException(place, "must not contain two underscores in a row", place.index("__"))
     except InvalidNamespaceException as error:
         text = f"namespace = {namespace!r}: {str(error).splitlines()[0]}"
         raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
@@ -109,6 +111,9 @@ class Connection:
         place, own = full_namespace(namespace), f"{name}_{os.getpid()}_{next(_NUMBERS)}"
         if domain is not None and domain not in DOMAINS:  # Fast DDS would end the process
             text = f"domain = {domain!r}: must be {DOMAINS[0]} to {DOMAINS[-1]}"
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, text)
+        if not (isinstance(timeout_s, float | int) and timeout_s > 0):
+            text = f"timeout_s = {timeout_s!r}: must be a number of seconds above 0"
             raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, text)
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)

@@ -89,7 +89,7 @@ def test_a_domain_that_cannot_be_is_refused(domain: Any) -> None:
     assert refused.value.error_code == ErrorCode.OUT_OF_RANGE
 
 
-@pytest.mark.parametrize("namespace", ["1bad", "my mirror", "a//b"])
+@pytest.mark.parametrize("namespace", ["1bad", "my mirror", "a//b", "a__b"])
 def test_a_namespace_that_cannot_be_is_refused(namespace: str) -> None:
     with pytest.raises(DeformableMirrorError, match="namespace = ") as refused:
         DeformableMirrorClient(namespace)

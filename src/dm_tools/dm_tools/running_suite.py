@@ -90,7 +90,9 @@ def calibration_refused(capabilities: Any) -> bool:
 
 
 def ago(seconds: float) -> str:
-    """A time that has passed, in the unit that fits it."""
+    """A time that has passed, in the unit that fits it; negative = by another clock, as with simulated time."""
+    if seconds < 0.0:
+        return "(by another clock) an unknown time"
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.0f} {unit}"

@@ -4,7 +4,7 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.sections import ConfigError
 from dm_bringup.suite import Config, load_config
 from dm_common.errors import unknown_name
+from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
 from dm_tools.doctor.electronics import electronics_checks
@@ -49,6 +50,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
     # Wrong values have been reported above; the checks below use only the valid ones.
     sound = {node: sound_values(node, values) for node, values in config.items()}
     yield "aperture of the maps", lambda: aperture_fits(sound)
+    yield "trigger command", lambda: trigger_program(sound.get("interferometer", {}).get("trigger_command", []))
     driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
         yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
@@ -136,13 +138,25 @@ def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
 
 
 def aperture_fits(config: Config) -> Finding | None:
-    """Whether the aperture that is configured for maps lies on the mirror."""
+    """Whether the aperture that is configured for maps lies on the mirror, and is the working aperture."""
     from dm_calibration.acquisition.ingest import too_large
 
     radius = effective("interferometer", config.get("interferometer", {}))["aperture.radius"]
-    diameter = effective("pdm_driver", config.get("pdm_driver", {}))["mirror.full_aperture_diameter"]
-    problem = too_large(radius, 0.5 * diameter)
-    return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver") if problem else None
+    driver = effective("pdm_driver", config.get("pdm_driver", {}))
+    if problem := too_large(radius, 0.5 * driver["mirror.full_aperture_diameter"]):
+        return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver")
+    working = 0.5 * driver["mirror.working_aperture_diameter"]
+    if radius > 0.0 and abs(radius - working) > APERTURE_TOLERANCE * working:
+        problem = f"aperture.radius = {radius:g} m: the working aperture of the mirror has a radius of {working:g} m"
+        return Finding(problem, "correct it, or mirror.working_aperture_diameter of pdm_driver: maps would be refused")
+    return None
+
+
+def trigger_program(command: Sequence[str]) -> Finding | None:
+    """Whether the program of the trigger command is installed."""
+    if not command or shutil.which(command[0]):
+        return None
+    return Finding(f"trigger_command = {command[0]!r}, ...: no such program", "correct it, or give its whole path")
 
 
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:

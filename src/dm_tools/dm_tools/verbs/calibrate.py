@@ -107,13 +107,14 @@ def show_result(result: Any, calibration: Any = None) -> None:
             f"{nanometres(result.held_out_rms):.2f} nm rms on maps held out"
         )
     if result.hysteresis_model:
-        promised = promise(promise_of(calibration)) if calibration is not None else "none while it is not in use"
+        promised = "none while it is not in use"
+        if calibration is not None:
+            promised = f"{promise(promise_of(calibration))} for the largest coefficient beyond what is predicted"
         expected = result.expected_max_zernike
         beforehand = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
         console.print(
-            f"promise: {promised} for the largest coefficient beyond what is predicted, from "
-            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{beforehand}; hysteresis "
-            f"{result.hysteresis_model}"
+            f"promise: {promised}, from {in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out"
+            f"{beforehand}; hysteresis {result.hysteresis_model}"
         )
     if calibration is not None:
         console.print(f"when flat: {two_fold(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
