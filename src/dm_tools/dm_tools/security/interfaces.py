@@ -32,7 +32,7 @@ HEALTH = "/diagnostics"
 #: What an operator's program subscribes to and calls.
 _HEARD = (HEALTH, "actuator_state", "calibration", "capabilities", "mirror_info", "recipes")
 _MAPS = ("surface_map", "surface_map_info")
-_OPERATION = ("flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
+_OPERATION = ("flatten", "hold_mirror", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("build_recipes", "calibrate", "converge", "degauss", "move_focus")
 
 
