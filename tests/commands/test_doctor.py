@@ -351,6 +351,7 @@ def test_what_would_end_the_first_run_is_told() -> None:
     finding = doctor_bench.aperture_fits(config)
     assert finding is not None and "the working aperture of the mirror has a radius of 0.011 m" in finding.problem
     assert doctor_bench.aperture_fits(config | {"interferometer": {"aperture.radius": 0.0}}) is None
+    assert doctor_bench.aperture_fits(config | {"calibration": {"aperture_tolerance": 0.1}}) is None
     finding = doctor_bench.trigger_program(["pyhton3", "{path}"])
     assert finding is not None and "trigger_command = 'pyhton3', ...: no such program" in finding.problem
     assert doctor_bench.trigger_program([sys.executable]) is None and doctor_bench.trigger_program([]) is None

@@ -1,4 +1,4 @@
-"""Allowed values of the fields of requests and goals to the nodes of this package."""
+"""Allowed values of the fields of requests and goals to the node `calibration`."""
 
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_calibration.influence.fit import METHODS

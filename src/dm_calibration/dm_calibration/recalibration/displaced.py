@@ -159,9 +159,7 @@ def described(
         return f"{found}; ./dm check --forget takes it back"
     if silent[sure].any():
         return f"{found}; ./dm calibrate measures it"
-    if min((abs(displaced[k].more) for k in sure), default=0.0) < FAILED_SIGNAL:
-        return found
-    if len(sure) + given_up.sum() >= len(expected):
+    if not sure or not all(_failed(displaced[k]) for k in sure) or len(sure) + given_up.sum() >= len(expected):
         return found
     without = " ".join(f"--without {actuator + 1}" for actuator in sure)
     condition = "if it is at the same place in another shape, " if "weakened" in faults else ""
@@ -174,15 +172,19 @@ def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernik
     The error of a stuck actuator is the move it is asked to make, which is largest to the far end of the range.
 
     Args:
-        displaced: as found by :func:`displaced_actuators`; only those with a probability of at least SURE count.
+        displaced: as found by :func:`displaced_actuators`; only those that failed count.
         expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
         zernike: (K, N) m per unit of effective signal.
     """
     furthest = np.zeros(len(expected))
-    for actuator, (more, probability) in displaced.items():
-        if probability >= SURE and abs(more) >= FAILED_SIGNAL:
-            furthest[actuator] = 1.0 + abs(expected[actuator] + more)
+    for actuator, one in displaced.items():
+        if _failed(one):
+            furthest[actuator] = 1.0 + abs(expected[actuator] + one.more)
     return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
+
+
+def _failed(one: Displaced) -> bool:
+    return one.probability >= SURE and abs(one.more) >= FAILED_SIGNAL
 
 
 def _fault(signal: float, more: float) -> str:

@@ -13,8 +13,8 @@ from dm_controller.planning.mirror_model import SIGMAS_95
 AGES = (1.0, 10.0, 100.0)
 #: Time after `crept_at` to which the figure refers, including creep left then, s: half of a typical run.
 IN_FIGURE_S = 200.0
-#: 95 % quantiles, in standard deviations: of one error, of the largest of as many independent ones as coefficients.
-ONE, LARGEST = SIGMAS_95, 2.5
+#: 95 % quantile of the largest of as many independent errors as coefficients, in standard deviations.
+LARGEST = 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
 #: Relative error of creep that is not known better: of elements with time constants (s) below and above these two, if
@@ -122,11 +122,11 @@ class CreepError:
             each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
         each = each @ np.square(self._rows).T
         count = self._coefficients
-        largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
+        largest = SIGMAS_95**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
         rms = (shared + each)[:, count:].sum(axis=1)
         worst = int(largest.argmax())
-        most = bool(ONE**2 * unseen[worst, :count].max() > 0.5 * largest[worst])
-        return CreepBound(float(np.sqrt(largest[worst])), ONE * float(np.sqrt(rms.max())), most)
+        most = bool(SIGMAS_95**2 * unseen[worst, :count].max() > 0.5 * largest[worst])
+        return CreepBound(float(np.sqrt(largest[worst])), SIGMAS_95 * float(np.sqrt(rms.max())), most)
 
     def drift(self, moved: HysteresisState, effective: Floats) -> tuple[float, float]:
         """Largest coefficient and rms sag, m, over AGES, of the creep of a shape that nothing corrects.

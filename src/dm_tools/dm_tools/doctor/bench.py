@@ -13,7 +13,6 @@ from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.sections import ConfigError
 from dm_bringup.suite import Config, load_config
 from dm_common.errors import unknown_name
-from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
 from dm_tools.doctor.electronics import electronics_checks
@@ -146,7 +145,8 @@ def aperture_fits(config: Config) -> Finding | None:
     if problem := too_large(radius, 0.5 * driver["mirror.full_aperture_diameter"]):
         return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver")
     working = 0.5 * driver["mirror.working_aperture_diameter"]
-    if radius > 0.0 and abs(radius - working) > APERTURE_TOLERANCE * working:
+    tolerance = effective("calibration", config.get("calibration", {}))["aperture_tolerance"]
+    if radius > 0.0 and "pdm_driver" in config and abs(radius - working) > tolerance * working:
         problem = f"aperture.radius = {radius:g} m: the working aperture of the mirror has a radius of {working:g} m"
         return Finding(problem, "correct it, or mirror.working_aperture_diameter of pdm_driver: maps would be refused")
     return None
