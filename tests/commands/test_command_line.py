@@ -486,6 +486,8 @@ def test_of_another_bench_the_wiring_comes_first() -> None:
     active = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE)
     assert first_command(refused, file) == "calibrate"
     assert verb_status._next([], "", active, used, None, refused) == "./dm calibrate"
+    lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST)
+    assert "must reach the electronics first" in verb_status._next([], "", lost, used, None, refused)
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,7 @@ def test_the_shipped_benches_are_well(name: str) -> None:
         doctor_bench.own_values,
         doctor_bench.parameters,
         doctor_bench.aperture_fits,
+        doctor_bench.one_record,
     ):
         assert check(config) is None
     for node in NODES:
@@ -73,6 +74,7 @@ PATHS = [
     ("interferometer", "watch_folder"),
     ("interferometer", "reference_surface"),
     ("calibration", "calibration_folder"),
+    ("calibration", "state_folder"),
     ("focus_controller", "state_folder"),
 ]
 
@@ -355,6 +357,14 @@ def test_what_would_end_the_first_run_is_told() -> None:
     finding = doctor_bench.trigger_program(["pyhton3", "{path}"])
     assert finding is not None and "trigger_command = 'pyhton3', ...: no such program" in finding.problem
     assert doctor_bench.trigger_program([sys.executable]) is None and doctor_bench.trigger_program([]) is None
+
+
+def test_nodes_that_begin_with_other_creep_are_told() -> None:
+    folders = {"focus_controller": {"state_folder": "/srv/creep"}, "calibration": {}}
+    finding = doctor_bench.one_record(folders)
+    assert finding and "'/srv/creep', calibration: '~/.ros/focus_controller'" in finding.problem
+    assert doctor_bench.one_record(folders | {"calibration": {"state_folder": "/srv/creep"}}) is None
+    assert doctor_bench.one_record({"focus_controller": {"state_folder": ""}}) is None
 
 
 def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

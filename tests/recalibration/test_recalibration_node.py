@@ -21,8 +21,11 @@ from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from dm_msgs.srv import HoldMirror, LoadCalibration, StoreRecipes, UpdateCalibration
 
 from calibration_stand_in import StandIn
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import HISTORY_UNKNOWN, NO_CALIBRATION, ErrorCode
+from dm_common.hysteresis.creep_record import CreepRecord, write_record
+from dm_common.hysteresis.model import CREEP_TIMES
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
@@ -87,12 +90,9 @@ def begin(
     folder = tmp_path / "calibrations"
     plant = LinearMirror(steady.mirror.x, steady.mirror.y, noise=NOISE, seed=2)
 
-    def begin(hysteresis: bool = False, **changes: Any) -> Suite:
+    def begin(hysteresis: HysteresisFit | None = None, **changes: Any) -> Suite:
         if not folder.exists():
-            calibration = steady.calibrate(time.time_ns())
-            CalibrationStore(folder).save(
-                replace(calibration, hysteresis=without_effect()) if hysteresis else calibration
-            )
+            CalibrationStore(folder).save(replace(steady.calibrate(time.time_ns()), hysteresis=hysteresis))
         values = {
             "calibration_folder": str(folder),
             "load_on_start": "newest",
@@ -193,7 +193,7 @@ def test_a_controller_that_was_restarted_alone_is_not_judged_by_what_another_nod
     begin: Callable[..., Suite], tmp_path: Path
 ) -> None:
     """Its wide bound was held against the error of a prediction that it cannot make."""
-    suite = begin(hysteresis=True)
+    suite = begin(hysteresis=without_effect())
     suite.bench.on_degauss(0)
     suite.shape()
     node, figures = suite.observer.node, tmp_path / "figures.json"
@@ -334,7 +334,7 @@ def test_drift_beyond_its_limit_is_a_warning(begin: Callable[..., Suite]) -> Non
 
 
 def test_with_a_hysteresis_an_unknown_history_is_refused_until_a_degauss(begin: Callable[..., Suite]) -> None:
-    suite = begin(hysteresis=True)
+    suite = begin(hysteresis=without_effect())
     suite.shape()
     refused = suite.call()
     assert refused.error_code == ErrorCode.MAP_REJECTED
@@ -343,6 +343,27 @@ def test_with_a_hysteresis_an_unknown_history_is_refused_until_a_degauss(begin: 
     suite.shape()
     taken = suite.call()
     assert taken.accepted, taken.message
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_maps_are_compared_with_the_creep_on_record(
+    read: bool, begin: Callable[..., Suite], steady: SteadyMirror, tmp_path: Path
+) -> None:
+    """After a restart it compared with actuators that had crept to nothing, other than the controller's."""
+    slowest = np.eye(len(CREEP_TIMES))[-1]
+    fit = without_effect()
+    fit = replace(fit, law=replace(fit.law, creep_rate=0.02, creep_time=CREEP_TIMES, creep_spectrum=slowest))
+    bowl = 1e4 * (steady.mirror.x**2 + steady.mirror.y**2)
+    crept = np.repeat(bowl[:, None], len(CREEP_TIMES), axis=1)
+    record = CreepRecord(time.time() - 1.0, CREEP_TIMES, crept, np.zeros(len(CREEP_TIMES)), np.zeros((len(bowl), 0)))
+    write_record(tmp_path / f"{steady.mirror.serial}.creep.npz", record)
+    suite = begin(hysteresis=fit, state_folder=str(tmp_path) if read else "")
+    suite.bench.on_degauss(0)
+    suite.shape()
+    taken = suite.call(dry_run=True)
+    assert taken.error_code == ErrorCode.OK, taken.message
+    # The mirror itself has no creep: what the record says of it is missing in the map.
+    assert (taken.max_zernike > 1e-8) == read, taken.max_zernike
 
 
 def test_a_damaged_file_of_updates_is_told(suite: Suite, begin: Callable[..., Suite]) -> None:

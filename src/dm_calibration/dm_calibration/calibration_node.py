@@ -32,6 +32,7 @@ from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import EXPECTED, NO_CALIBRATION, ErrorCode, error_code
+from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import mirror_from, recipe_book_from, recipe_book_message, time_message
 from dm_common.recipes import NO_RECIPES
 from dm_common.ros import qos
@@ -70,6 +71,8 @@ class CalibrationNode(ManagedNode):
             self, Calibrate, "calibrate", self._calibrate, exclusive="refuse", fields=requests.CALIBRATE
         )
         self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
+        observer = self._listener.history.observer
+        self._recorder = CreepRecorder(self._values["state_folder"], observer, self.get_logger().warning)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
         fields = requests.FIT_INFLUENCE_FUNCTION
@@ -93,6 +96,7 @@ class CalibrationNode(ManagedNode):
         if folder != self._manager.store.folder:
             self.clean_up()  # the calibration in use is not in the new folder
             self._manager.store.folder = folder
+        self._recorder.folder = self._values["state_folder"]
 
     def activate(self) -> None:
         wanted, in_use = self._values["load_on_start"], self._manager.in_use is not None
@@ -149,8 +153,7 @@ class CalibrationNode(ManagedNode):
             self.get_logger().error(f"mirror_info refused: {error}")
             return
         self._driver_facts, before = driver_facts(message), self._manager.mirror
-        if before is not None and before.serial != mirror.serial:
-            self._listener.history.forget()
+        self._recorder.recall(mirror.serial, 1e-9 * self.get_clock().now().nanoseconds)
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         if before is not None and before.limits.middle != mirror.limits.middle:

@@ -9,6 +9,7 @@ from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.plan import PlanOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift import UpdateOptions
+from dm_common.hysteresis.creep_record import STATE_FOLDER
 from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of
 from dm_common.values import from_values, real, switch, text, whole
@@ -26,6 +27,12 @@ PARAMETERS = (
         "write_report",
         switch(True),
         "Write a report, <id>.html and <id>.pdf, beside the file of every calibration that is stored.",
+    ),
+    Parameter(
+        "state_folder",
+        text(STATE_FOLDER, path=True),
+        "Folder in which focus_controller keeps what actuators have crept to, its state_folder: read at the start, so "
+        "that maps are compared with the same creep; empty = not known.",
     ),
     *parameters_of("", PlanOptions),
     live("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time."),

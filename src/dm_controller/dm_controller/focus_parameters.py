@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Final
 
+from dm_common.hysteresis.creep_record import STATE_FOLDER
 from dm_common.limits import DEGAUSS_STEPS_MAX, DEGAUSS_STEPS_MIN
 from dm_common.ros.parameters import AUTOSTART, Parameter, live
 from dm_common.values import Fields, real, reals, switch, text, whole
@@ -107,7 +108,7 @@ PARAMETERS: Final = (
     ),
     Parameter(
         "state_folder",
-        text("~/.ros/focus_controller", path=True),
+        text(STATE_FOLDER, path=True),
         "folder for the creep state of each mirror's actuators, which the next start reads; empty = keep nothing",
     ),
     live(

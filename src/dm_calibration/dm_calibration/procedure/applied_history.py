@@ -35,19 +35,19 @@ class SettledState:
 
 
 class AppliedHistory:
-    """Recent states of the mirror under one hysteresis model; every method is thread-safe."""
+    """Recent states of the mirror under one hysteresis model; every method is thread-safe.
+
+    Attributes:
+        observer: of the mirror.
+    """
 
     def __init__(self) -> None:
-        self._observer = HysteresisObserver()
+        self.observer = HysteresisObserver()
         self._heard = float("-inf")
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
         """Follow `law` from now on, and apply it to earlier reports as well; None = no hysteresis."""
-        self._observer.use(law or HysteresisModel.linear(), middle)
-
-    def forget(self) -> None:
-        """Forget all reports: another mirror was connected, whose history is not known."""
-        self._observer.recall(None, another=True)
+        self.observer.use(law or HysteresisModel.linear(), middle)
 
     def observe(self, report: Applied) -> None:
         """Take the driver's next report.
@@ -55,7 +55,7 @@ class AppliedHistory:
         Raises:
             ValueError: as :meth:`HysteresisObserver.observe`; earlier reports are forgotten.
         """
-        self._observer.observe(report)
+        self.observer.observe(report)
         self._heard = report.heard  # set last: a thread that waits for it finds the report processed
 
     def heard_since(self, time: float) -> bool:
@@ -64,7 +64,7 @@ class AppliedHistory:
 
     def still_for(self, time: float) -> float:
         """How long the mirror had kept its present shape at `time`, s; 0 = it moves, infinite = no report yet."""
-        observed = self._observer.recent()
+        observed = self.observer.recent()
         if not observed:
             return float("inf")
         if not self._keeps(observed[-1], observed[-1]):
@@ -80,7 +80,7 @@ class AppliedHistory:
         Raises:
             MapNotUsableError: the mirror moved, or this or the hysteresis of the actuators is not known.
         """
-        law, observed = self._observer.law, self._observer.recent()
+        law, observed = self.observer.law, self.observer.recent()
         times = [seen.report.time for seen in observed]
         at = next((k for k in reversed(range(len(observed))) if times[k] <= time), None)
         if at is None:
@@ -117,7 +117,7 @@ class AppliedHistory:
 
     def _keeps(self, shape: Observed, seen: Observed) -> bool:
         """Whether the mirror had the shape of report `shape` at report `seen`: same signals, or same surface."""
-        law, state, report = self._observer.law, seen.estimate.state, seen.report
+        law, state, report = self.observer.law, seen.estimate.state, seen.report
         ends = [report.signals]
         if report.moving:
             if report.requested is None:

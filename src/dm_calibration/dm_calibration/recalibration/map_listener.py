@@ -57,7 +57,7 @@ class MapListener:
         self._node, self._values = node, values
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
-        self.history = AppliedHistory()  # signals applied to this mirror; the node clears it for another mirror
+        self.history = AppliedHistory()  # of this mirror; the node has it begin anew for another one
         self._followed: Any = None  # law and mid range
         self._turn = threading.Lock()  # one map at a time; held while measuring and judging
         self._exchange = threading.Lock()  # a map is compared under the law of its effective signals

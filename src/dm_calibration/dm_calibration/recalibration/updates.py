@@ -157,7 +157,7 @@ class RecalibrationManager:
             found = comparison.displaced, updates.reached(settled.effective)
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
-                reason += described(*found, np.isfinite(updates.stuck), without_response(calibration))
+                reason += described(*found, np.isfinite(kept.drift.stuck), without_response(calibration))
             elif without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from dm_common.hysteresis.model import HysteresisModel, HysteresisState
     from dm_common.hysteresis.observer import HysteresisObserver
 
+#: Folder in which the focus controller keeps its records, unless configured otherwise.
+STATE_FOLDER = "~/.ros/focus_controller"
 #: Standard deviation of a shape held unobserved, relative to one of the whole range: 2 sigma reach that.
 UNSEEN = 0.5
 #: Time constant, s, above which a calibration run does not determine creep elements; relative error of their weights.

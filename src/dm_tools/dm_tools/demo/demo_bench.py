@@ -93,7 +93,7 @@ def bench_config(
     if bench.get("electronics.pty_link"):
         bench["electronics.pty_link"] = driver["electronics.serial_port"] = str(folder / "tty")
     driver |= {"electronics.port": tcp, "state_folder": str(folder / "driver")}
-    config["focus_controller"]["state_folder"] = str(folder / "controller")
+    config["focus_controller"]["state_folder"] = config["calibration"]["state_folder"] = str(folder / "controller")
     config["interferometer"]["watch_folder"] = str(folder / "maps")
     config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
     (folder / "maps").mkdir(parents=True, exist_ok=True)

@@ -49,6 +49,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
     # Wrong values have been reported above; the checks below use only the valid ones.
     sound = {node: sound_values(node, values) for node, values in config.items()}
     yield "aperture of the maps", lambda: aperture_fits(sound)
+    yield "record of creep", lambda: one_record(sound)
     yield "trigger command", lambda: trigger_program(sound.get("interferometer", {}).get("trigger_command", []))
     driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
@@ -150,6 +151,16 @@ def aperture_fits(config: Config) -> Finding | None:
         problem = f"aperture.radius = {radius:g} m: the working aperture of the mirror has a radius of {working:g} m"
         return Finding(problem, "correct it, or mirror.working_aperture_diameter of pdm_driver: maps would be refused")
     return None
+
+
+def one_record(config: Config) -> Finding | None:
+    """Whether both nodes that follow the actuators begin with the same record of what these have crept to."""
+    nodes = [node for node in ("focus_controller", "calibration") if node in config]
+    folders = {node: effective(node, config[node])["state_folder"] for node in nodes}
+    if len(set(folders.values())) < 2:
+        return None
+    told = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
+    return Finding(f"state_folder differs ({told}): maps would be compared with other creep", "give both the same")
 
 
 def trigger_program(command: Sequence[str]) -> Finding | None:

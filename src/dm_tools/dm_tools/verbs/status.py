@@ -132,6 +132,8 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
 def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
     if lacking:
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
+    if state is not None and state.driver_state == state.STATE_LINK_LOST:
+        return "the driver must reach the electronics first: ./dm doctor --config FILE says what is wrong"
     if state is None or state.driver_state != state.STATE_ACTIVE:
         resting = state is not None and state.driver_state == state.STATE_INACTIVE
         first = "`ros2 lifecycle set /pdm_driver activate`; " if resting else ""
