@@ -122,7 +122,7 @@ TEXTS = {
 RUN = (
     "./dm status",
     "./dm calibrate",
-    "./dm calibrate --hysteresis 300 --dry-run",
+    "./dm calibrate --dry-run",
     "./dm focus 0.02",
     "./dm check --dry-run",
     "./dm report",
@@ -165,7 +165,7 @@ PARSED = {
     "./dm calibrate --plan pokes": _LONG + "test_doctor.py and others make such a calibration",
     "./dm calibrate --until 2nm": _LONG + "test_calibrate_command.py checks what it asks for",
     "./dm calibrate --fresh": _LONG + "test_end_to_end.py runs the plan",
-    "./dm calibrate --hysteresis 300": _LONG + "test_calibration_node.py and the demo run the plan",
+    "./dm calibrate --hysteresis 200": _LONG + "test_calibration_node.py and the demo run the plan",
     "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
     "./dm calibrate --plan poke-check": _LONG + "test_whole_runs.py runs the plan",
     "./dm recipes": _LONG + "test_loop_actions.py runs the action",

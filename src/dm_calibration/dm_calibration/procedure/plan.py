@@ -89,7 +89,7 @@ class PlanOptions:
     surfaces: Sequence[str] = ()
     degauss: bool = True
     hysteresis_maps: int = live_parameter(
-        whole(200, MAPS_MIN, MAPS_MAX),
+        whole(300, MAPS_MIN, MAPS_MAX),
         "Commands of a hysteresis plan, at least two for each actuator; more of them reduce the noise.",
     )
     until: float = 0.0
