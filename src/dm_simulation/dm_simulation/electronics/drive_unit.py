@@ -56,15 +56,18 @@ class DriveUnit:
     def __init__(self, config: DriveConfig) -> None:
         self.config = config
         wiring = np.asarray(config.wiring, int)
+        self._span = config.dac_volts_at_full - config.dac_volts_at_zero
+        self._power = 2 if config.squared else 1
+        #: Quantity at signals -1 and +1: V, or V^2 if `squared`.
+        self._low, self._high = config.volts_min**self._power, config.volts_max**self._power
         last = config.channels - 1
         if not wiring.size or len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
             raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to {last}")
-        low, high = self._signal_range
         square = " squared" if config.squared else ""
         for name, value in (
             ("electronics.dac_volts_at_full - electronics.dac_volts_at_zero", self._span),
             ("electronics.amplifier_gain", config.amplifier_gain),
-            (f"volts.max{square} - volts.min{square}", high - low),
+            (f"volts.max{square} - volts.min{square}", self._high - self._low),
         ):
             if value == 0:
                 raise ValueError(f"{name} = 0: must not be zero")
@@ -77,43 +80,25 @@ class DriveUnit:
         at_rest = np.clip(-config.dac_volts_at_zero / self._span, 0, 1)
         #: Outputs as fractions of the DAC's range; a unit of few channels still has the registers of an EDAC40.
         self.outputs: Array = np.full(max(frames.CHANNELS, config.channels), at_rest)
-        self._codes = np.zeros(frames.CHANNELS, np.int64)
-        self._offset = np.full(frames.CHANNELS, 0x8000, np.int64)
-        self._gain = np.full(frames.CHANNELS, 0xFFFF, np.int64)
+        #: Values, offsets and gains of the channels, in the order of the commands that set them.
+        self._registers = np.repeat([[0], [0x8000], [0xFFFF]], frames.CHANNELS, axis=1)
         self._global_offset = FACTORY_GLOBAL_OFFSET
         self.settings_frames = 0
 
-    @property
-    def _span(self) -> float:
-        return self.config.dac_volts_at_full - self.config.dac_volts_at_zero
-
-    @property
-    def _power(self) -> int:
-        return 2 if self.config.squared else 1
-
-    @property
-    def _signal_range(self) -> tuple[float, float]:
-        """Quantity at signals -1 and +1: V, or V^2 if `squared`."""
-        return self.config.volts_min**self._power, self.config.volts_max**self._power
-
     def take_edac40(self, frame: frames.EdacFrame) -> None:
         """Carry out an EDAC40 frame. Only value frames occur in normal operation; the others are counted."""
-        if frame.command == frames.EDAC40_VALUE:
-            self._codes[frame.channels] = frame.values
+        self.settings_frames += frame.command != frames.EDAC40_VALUE
+        if frame.command == frames.EDAC40_SAVE:
+            return
+        touched = slice(None) if frame.command == frames.EDAC40_GLOBAL_OFFSET else frame.channels
+        if frame.command == frames.EDAC40_GLOBAL_OFFSET:
+            self._global_offset = int(frame.values[-1]) & 0x3FFF
         else:
-            self.settings_frames += 1
-            if frame.command == frames.EDAC40_OFFSET:
-                self._offset[frame.channels] = frame.values
-            elif frame.command == frames.EDAC40_GAIN:
-                self._gain[frame.channels] = frame.values
-            elif frame.command == frames.EDAC40_GLOBAL_OFFSET:
-                self._global_offset = int(frame.values[-1]) & 0x3FFF
-        if frame.command != frames.EDAC40_SAVE:
-            outputs = self.outputs[: frames.CHANNELS]
-            dac = self._codes * (self._gain + 1) // 65536 + self._offset - 0x8000
-            shift = 4 * (self._global_offset - FACTORY_GLOBAL_OFFSET)
-            touched = slice(None) if frame.command == frames.EDAC40_GLOBAL_OFFSET else frame.channels
-            outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
+            self._registers[frame.command, touched] = frame.values
+        code, offset, gain = self._registers[:, touched]
+        dac = code * (gain + 1) // 65536 + offset - 0x8000
+        shift = 4 * (self._global_offset - FACTORY_GLOBAL_OFFSET)
+        self.outputs[: frames.CHANNELS][touched] = (np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE
 
     def take_shares(self, outputs: Array) -> None:
         """Carry out a frame of a serial unit: its channels (C,) as shares of the DAC's range."""
@@ -127,5 +112,4 @@ class DriveUnit:
 
     def signals(self) -> Array:
         """Normalised signals (N,) that the actuators really get; beyond -1..+1 when driven too far."""
-        low, high = self._signal_range
-        return 2 * (self.actuator_volts() ** self._power - low) / (high - low) - 1
+        return 2 * (self.actuator_volts() ** self._power - self._low) / (self._high - self._low) - 1
