@@ -86,11 +86,7 @@ def check_changes(changes: Mapping[str, Any]) -> None:
 
 
 def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
-    """The optics of the camera.
-
-    Raises:
-        ValueError: inconsistent optics, or a region outside the image.
-    """
+    """The optics of the camera. Raises ValueError for inconsistent optics, or a region outside the image."""
     check_region(values["region"])
     others = {name: values[f"optics.{name}"] for name in ("relay_magnification", "incidence", "pupil_offset")}
     return FocusOptics.from_rest_distance(values["optics.rest_distance"], **others)
@@ -102,11 +98,7 @@ def tolerance_of(values: Mapping[str, Any], aperture_radius: float) -> float:
 
 
 def search_config(values: Mapping[str, Any], aperture_radius: float, low: float, high: float) -> SearchConfig:
-    """The search of a range of curvatures [1/m].
-
-    Raises:
-        ValueError: the aperture has no radius.
-    """
+    """The search of a range of curvatures [1/m]. Raises ValueError if the aperture has no radius."""
     tolerance = tolerance_of(values, aperture_radius)
     points = max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance)))
     return from_values(SearchConfig, values, "search.", low=low, high=high, tolerance=tolerance, coarse_points=points)

@@ -263,11 +263,7 @@ class FocusProbe:
         return SharpnessSample(sharpness, samples[-1].image, tuple(sample.regions[0] for sample in samples))
 
     def sharpness_of(self, message: Image | CompressedImage, region: Region) -> SharpnessSample:
-        """Sharpness of an image in a region.
-
-        Raises:
-            Refusal: the image cannot be used.
-        """
+        """Sharpness of an image in a region. Raises Refusal if the image cannot be used."""
         try:
             image = raw_image(message)
             part = cut(grey(image), region)

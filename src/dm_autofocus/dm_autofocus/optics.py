@@ -142,11 +142,7 @@ class FocusOptics:
 
 
 def dioptre_of(distance: float, name: str = "distance") -> float:
-    """1 / distance; a distance [m] of 0 or inf means infinity, dioptre 0.
-
-    Raises:
-        OpticsError: negative or NaN.
-    """
+    """1 / distance; a distance [m] of 0 or inf means infinity, dioptre 0. Raises OpticsError if negative or NaN."""
     if math.isnan(distance) or distance < 0:
         raise OpticsError(f"{name} = {distance} m: must be above 0, or 0 or inf for infinity")
     return 1 / distance if distance > 0 and math.isfinite(distance) else 0.0

@@ -24,11 +24,7 @@ SMALLEST = 3
 
 
 def check_region(region: Sequence[float]) -> Region:
-    """The region as a tuple.
-
-    Raises:
-        ValueError: not four numbers, or not inside the image.
-    """
+    """The region as a tuple. Raises ValueError if it is not four numbers, or not inside the image."""
     if len(region) != 4:
         raise ValueError(f"region = {list(region)}: must be four numbers, left, top, width, height")
     left, top, width, height = (float(value) for value in region)
@@ -61,11 +57,7 @@ def region_of(roi: Any, width: int, height: int) -> Region:
 
 
 def cut(image: NDArray, region: Region = WHOLE) -> NDArray:
-    """View of the region of an image (H, W), at least SMALLEST pixels along each side.
-
-    Raises:
-        ValueError: the image or the region in it is too small.
-    """
+    """View of the region of an image (H, W). Raises ValueError if it has less than SMALLEST pixels along a side."""
     left, top, width, height = region
     rows, columns = image.shape
     first_row, first_column = math.floor(top * rows), math.floor(left * columns)

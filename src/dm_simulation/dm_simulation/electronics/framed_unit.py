@@ -71,11 +71,7 @@ def check_value(kind: str, data: bytes) -> int:
 
 
 class FramedDecoder:
-    """Finds frames in a stream.
-
-    Raises:
-        ValueError: an inconsistent description; the message names the parameter.
-    """
+    """Finds frames in a stream. Raises ValueError for an inconsistent description; the message names the parameter."""
 
     def __init__(self, config: FramedConfig) -> None:
         for name in ("header", "terminator", "opening", "reply"):

@@ -43,11 +43,7 @@ class EdacFrame:
 
 
 def edac40_length(header: bytes) -> int:
-    """Length of the frame that starts with these six bytes.
-
-    Raises:
-        FrameError: unknown command or empty channel mask.
-    """
+    """Length of the frame that starts with these six bytes. Raises FrameError: unknown command or empty mask."""
     if header[5] > EDAC40_SAVE:
         raise FrameError(f"unknown EDAC40 command {header[5]}")
     channels = int.from_bytes(header[:5], "little").bit_count()
@@ -57,11 +53,7 @@ def edac40_length(header: bytes) -> int:
 
 
 def decode_edac40(frame: bytes) -> EdacFrame:
-    """Decode one whole EDAC40 frame.
-
-    Raises:
-        FrameError: wrong length for its mask, unknown command, empty mask.
-    """
+    """Decode one whole EDAC40 frame. Raises FrameError: wrong length for its mask, unknown command, empty mask."""
     if len(frame) < EDAC40_HEADER + 2:
         raise FrameError(f"EDAC40 frame of {len(frame)} bytes, at least 8 are needed")
     length = edac40_length(frame[:EDAC40_HEADER])

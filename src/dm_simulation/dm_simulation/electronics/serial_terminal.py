@@ -52,11 +52,7 @@ class SerialTerminal:
         self._received = bytearray()
 
     def open(self, link: Path) -> None:
-        """Make the terminal and the symbolic link to it.
-
-        Raises:
-            OSError: the link cannot be made.
-        """
+        """Make the terminal and the symbolic link to it. Raises OSError if the link cannot be made."""
         leader, follower = os.openpty()
         self._descriptors = (leader, follower)  # the follower stays open, so that the outputs outlast the client
         tty.setraw(follower)
