@@ -215,8 +215,7 @@ class Connection:
         with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
             again_s = self._timeout_s if again else math.inf
-            cancelled, ready_s = (lambda: bool(gone())), self._timeout_s
-            response = call(self.clients[name], request, timeout_s, cancelled, again_s, ready_s=ready_s)
+            response = call(self.clients[name], request, timeout_s, gone, again_s, ready_s=self._timeout_s)
         return checked(response)
 
     def run_action(
@@ -233,11 +232,10 @@ class Connection:
         Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel the goal, so that the mirror is left
         in a safe state; `identity`: see `run_goal`.
         """
-        server, failed = self._servers.get(name), list[Exception]()
+        failed = list[Exception]()
 
         def take(feedback: Any) -> None:
-            if server is not None:
-                server.heard()  # feedback proves that the node is alive, even if a busy machine missed its lease
+            self._servers[name].heard()  # feedback proves that the node lives, even if a busy machine missed its lease
             try:
                 if not failed:
                     on_feedback(feedback)
@@ -271,10 +269,9 @@ class Connection:
         if name not in self.clients:
             text = f"{name!r}: must be one of {', '.join(self.clients)}"
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
-        server = self._servers.get(name)  # None for a client that the user of this class has added
-        if server is not None:
-            server.wait_for_return()
-        lost = server.since_now() if server is not None else lambda: ""
+        server = self._servers[name]
+        server.wait_for_return()
+        lost = server.since_now()
 
         def gone() -> str:
             return self._over() or lost()
@@ -289,6 +286,6 @@ class Connection:
             code, text = error.error_code, str(error)
             client = self.clients[name]
             served = client.server_is_ready if isinstance(client, ActionClient) else client.service_is_ready
-            if server is not None and (reason := lost() or (server.text if server.missing(served) else "")):
+            if reason := lost() or (server.text if server.missing(served) else ""):
                 code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {reason}"
             raise DeformableMirrorError(code, text) from error

@@ -20,6 +20,11 @@ from dm_client import DeformableMirrorClient, DeformableMirrorError, connection
 from dm_common.errors import ErrorCode
 from dm_common.ros.qos import Liveliness
 
+#: A node that is there.
+THERE: Any = SimpleNamespace(
+    heard=lambda: None, wait_for_return=lambda: None, since_now=lambda: lambda: "", missing=lambda _served: False
+)
+
 
 def client(driver: int, able: int | None) -> DeformableMirrorClient:
     """One that has heard this state of the driver and this code of the controller; None = there is no controller."""
@@ -58,10 +63,8 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine the lease of a node that goes on with a run may lapse for its client."""
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     heard, feedback = list[int](), list[str]()
-    server = SimpleNamespace(
-        heard=lambda: heard.append(len(feedback)), wait_for_return=lambda: None, since_now=lambda: lambda: ""
-    )
-    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
+    server: Any = SimpleNamespace(**vars(THERE) | {"heard": lambda: heard.append(len(feedback))})
+    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0
 
     def run_goal(*_arguments: object, on_feedback: object, **_options: object) -> Converge.Result:
         on_feedback("step 1")  # type: ignore[operator]
@@ -75,8 +78,7 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     """rclpy's executor ends the whole process with it."""
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
-    server = SimpleNamespace(heard=lambda: None, wait_for_return=lambda: None, since_now=lambda: lambda: "")
-    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
+    asked._servers, asked.clients, asked._timeout_s = {"converge": THERE}, {"converge": None}, 1.0
     cancelled = list[bool]()
 
     def run_goal(*_arguments: object, on_feedback: Any, stop: Any, **_options: object) -> Converge.Result:
@@ -144,7 +146,7 @@ def test_a_name_that_is_not_served_is_refused(domain: int) -> None:
 def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -> None:
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     absent = SimpleNamespace(service_is_ready=lambda: False, srv_name="/measure")
-    asked._servers, asked.clients, asked._timeout_s = {}, {"measure": absent}, 0.1
+    asked._servers, asked.clients, asked._timeout_s = {"measure": THERE}, {"measure": absent}, 0.1
     with pytest.raises(DeformableMirrorError, match=r"no such service within 0\.1 s"):
         asked.measure()
 
@@ -164,7 +166,8 @@ def test_a_node_that_never_came_is_named() -> None:
 
 def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
-    asked._servers, asked.clients, asked._timeout_s = {}, dict.fromkeys(("set_signals", "move_focus")), 10.0
+    names = ("set_signals", "move_focus")
+    asked._servers, asked.clients, asked._timeout_s = dict.fromkeys(names, THERE), dict.fromkeys(names), 10.0
     limits = list[tuple[float, ...]]()  # of waiting, and after which a request to a service is sent again
 
     def answer(_client: object, request: Any, timeout_s: float, *more: Any, **_options: object) -> Any:
