@@ -78,9 +78,10 @@ class VirtualBenchNode(Node):
             # Reliable: viewers that require it get images too. Depth 1: an image not fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
             self._info_publisher = self.create_publisher(CameraInfo, "camera_info", qos.MAP)
-            self._camera_frame = f"{self.get_namespace()}/camera_optical".lstrip("/")  # REP 103
-            k = camera_matrix(self.bench.config.camera)
-            self._camera_info = CameraInfo(distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3).ravel(), k=k)
+            camera = self.bench.config.camera
+            size, k = {"height": camera.height, "width": camera.width}, camera_matrix(camera)
+            self._camera_info = CameraInfo(**size, distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3).ravel(), k=k)
+            self._camera_info.header.frame_id = f"{self.get_namespace()}/camera_optical".lstrip("/")  # REP 103
             self._camera_info.p = np.pad(np.reshape(k, (3, 3)), [(0, 0), (0, 1)]).ravel()
             self._start(self._film, 1 / values["camera.rate"])
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
@@ -119,20 +120,17 @@ class VirtualBenchNode(Node):
 
     def _film(self, period: float) -> None:
         while not self._stop.wait(period - time.monotonic() % period):
-            now = self._now()
+            header = self._camera_info.header
+            header.stamp = self._now().to_msg()
             try:
                 picture = self.bench.photograph()
             except OSError:  # the bench is closing
                 return
             height, width = picture.shape
-            message = Image(height=height, width=width, encoding="mono8", step=width)
-            message.header.stamp = now.to_msg()
-            message.header.frame_id = self._camera_frame
-            message.data = array.array("B", picture.tobytes())
-            self._image_publisher.publish(message)
-            info = self._camera_info
-            info.header, info.height, info.width = message.header, height, width
-            self._info_publisher.publish(info)
+            image = Image(header=header, height=height, width=width, encoding="mono8", step=width)
+            image.data = array.array("B", picture.tobytes())
+            self._image_publisher.publish(image)
+            self._info_publisher.publish(self._camera_info)
 
     def _on_event(self, severe: bool, text: str) -> None:
         logger = self.get_logger()

@@ -1,7 +1,6 @@
 """One thread that waits on all sockets of the bench and owns everything that their data change."""
 
 import asyncio
-import socket
 import threading
 from collections.abc import Callable
 from typing import TypeVar
@@ -14,22 +13,19 @@ class EventLoop:
 
     Args:
         on_error: called when a handler raised an exception; the loop continues.
+
+    Attributes:
+        watch: calls a handler whenever a socket or descriptor is readable.
+        forget: stops watching it, if it was watched; to be called before closing.
     """
 
     def __init__(self, name: str, on_error: Callable[[Exception], None]) -> None:
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(lambda _, context: on_error(context["exception"]))
+        self.watch, self.forget = self._loop.add_reader, self._loop.remove_reader
         self._closed = False
         self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
         self._thread.start()
-
-    def watch(self, endpoint: socket.socket | int, handler: Callable[[], None]) -> None:
-        """Call `handler` whenever `endpoint` is readable."""
-        self._loop.add_reader(endpoint, handler)
-
-    def forget(self, endpoint: socket.socket | int) -> None:
-        """Stop watching, if it was watched; to be called before closing."""
-        self._loop.remove_reader(endpoint)
 
     def run(self, task: Callable[[], T]) -> T:
         """Run `task` in the loop's thread, after all data that have arrived by now, and return its value.
