@@ -113,14 +113,9 @@ def given_focal_length(values: Mapping[str, Any], camera_info: Any) -> float:
 
 
 def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: Any) -> FocusLens:
-    """The lens data that determine how defocus looks in the camera.
+    """How defocus looks in the camera; `aperture_radius` [m] of the beam on the mirror, `camera_info` as above.
 
-    Args:
-        aperture_radius: of the beam on the mirror [m].
-        camera_info: a sensor_msgs/CameraInfo; None = none came yet.
-
-    Raises:
-        ValueError: the focal length is not known.
+    Raises ValueError if the focal length is not known.
     """
     focal_length = given_focal_length(values, camera_info)
     if not focal_length > 0:

@@ -77,7 +77,6 @@ class CameraFocusClient(DeformableMirrorClient):
             curvature_range: search only here [1/m]; (0, 0) = the whole reachable range.
             on_feedback: called after each image that was used.
             timeout_s: longest time the search may take.
-            claim: see `Claim`, for a mirror that somebody holds.
         """
         goal = filled(Autofocus.Goal, region=region, **_ends(curvature_range), **claim)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
@@ -125,7 +124,6 @@ class CameraFocusClient(DeformableMirrorClient):
             curvature_range: sweep only here [1/m]; (0, 0) = the whole reachable range.
             on_feedback: called after each image.
             timeout_s: longest time the stack may take.
-            claim: see `Claim`, for a mirror that somebody holds.
 
         Returns:
             The result; an image that is sharp everywhere, (H, W, channels) in the camera's encoding; distances [m],
@@ -155,7 +153,6 @@ class CameraFocusClient(DeformableMirrorClient):
             pairs: number of images on either side of the focus, taken alternately; 2 at least.
             image_topic: of the camera, as in `autofocus`; the same with /compressed appended is used as well.
             stamp_lead: by how much an exposure begins before its image's stamp [s], as in `autofocus`.
-            claim: see `Claim`, for a mirror that somebody holds.
 
         Raises:
             DeformableMirrorError: an argument is invalid, a search or a move failed, or images do not arrive, cannot be

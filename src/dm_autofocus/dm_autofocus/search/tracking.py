@@ -161,8 +161,7 @@ class MotionTracker(Tracker):
     """A tracker for a known camera and mirror.
 
     Args:
-        peak, search: as of a `Tracker`.
-        config: likewise; its dither is above 0.
+        peak, search, config: as of a `Tracker`, with a dither above 0.
         model: of the camera.
 
     Attributes:
