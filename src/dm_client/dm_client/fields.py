@@ -56,8 +56,6 @@ def _field(name: str, value: Any, type_name: str) -> Any:
             return [_one(name, each, element) for each in value]
         return _one(name, value, element)
     except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, DeformableMirrorError):
-            raise
         text = f"{name} = {value!r}: must be {type_name.replace('boolean', 'true or false')}"
         raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
 

@@ -74,11 +74,13 @@ class FramedDecoder:
     """Finds frames in a stream. Raises ValueError for an inconsistent description; the message names the parameter."""
 
     def __init__(self, config: FramedConfig) -> None:
+        parts = []
         for name in ("header", "terminator", "opening", "reply"):
             try:
-                bytes.fromhex(getattr(config, name))
+                parts.append(bytes.fromhex(getattr(config, name)))
             except ValueError:
                 raise ValueError(f"framed.{name} = {getattr(config, name)!r}: must be hexadecimal bytes") from None
+        self._header, self._terminator, self._opening, self.reply = parts
         if config.channel_order and sorted(config.channel_order) != list(range(config.channels)):
             raise ValueError(f"framed.channel_order: must hold each of 0 to {config.channels - 1} once, or be empty")
         width = config.word_bits or (config.bits + 7) // 8 * 8
@@ -87,9 +89,6 @@ class FramedDecoder:
         if config.scale == 0:
             raise ValueError("framed.scale = 0: must not be zero")
         self.config = config
-        self.reply = bytes.fromhex(config.reply)
-        self._header, self._terminator = bytes.fromhex(config.header), bytes.fromhex(config.terminator)
-        self._opening = bytes.fromhex(config.opening)
         self._width = width
         self._payload = (config.channels * width + 7) // 8
         self._check = CHECK_LENGTH[config.checksum]
