@@ -3,8 +3,6 @@
 `from dm_autofocus import CameraFocusClient` is what a program needs that uses the camera.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -18,11 +18,9 @@ libcamera (`LensPosition` [26]) and Android (`LENS_FOCUS_DISTANCE` [27]); positi
 x curvature. Source: [2], sections 4.4 and 4.6 (oblique powers by Coddington).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +67,7 @@ class FocusOptics:
             raise OpticsError(f"incidence = {self.incidence} rad: must be from 0 to below pi/2")
 
     @classmethod
-    def from_rest_distance(cls, rest_distance: float, **others: float) -> FocusOptics:
+    def from_rest_distance(cls, rest_distance: float, **others: float) -> Self:
         """The optics of a camera that is in focus at `rest_distance` (m, 0 or inf = infinity) while the mirror is flat.
 
         Args:

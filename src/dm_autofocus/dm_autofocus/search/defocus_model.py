@@ -164,13 +164,9 @@ class DefocusModel:
         return float(self._gradient @ powers)
 
     def transfer(self, defocus: Floats) -> tuple[Floats, Floats]:
-        """Share of the power that passes, and the largest that this may be for a pupil that is not ideal.
+        """Shares of the power that pass, and the largest that these may be for a pupil that is not ideal, (..., K).
 
-        Args:
-            defocus: difference of curvatures [1/m], (...).
-
-        Returns:
-            Two arrays (..., K).
+        `defocus` is the difference of curvatures [1/m], (...).
         """
         place = np.minimum(np.abs(defocus) / self._step, len(self._transfer) - 1.001)
         first = place.astype(int)
