@@ -80,7 +80,7 @@ def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
     plan = make_plan(PlanKind.POKES, mirror, PlanOptions())
     outcome = Procedure(plan, mirror, lagging_bench(mirror), ProcedureOptions()).run()
     small = calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance("small", 10**18))
-    html, pdf = write_report(small, tmp_path)
+    html, pdf = write_report(small, tmp_path, CalibrationStore(tmp_path).save(small))
     text = html.read_text()
     actuators = text[text.index("<caption>Actuators") :]
     assert re.findall(r"<tr><td>(\d+)</td>", actuators[: actuators.index("</table>")]) == [

@@ -152,11 +152,7 @@ def every_map(calibration: Calibration) -> Section:
 
 
 def files(calibration: Calibration, file: str, sha256: str) -> Section:
-    """Files and their hashes.
-
-    Args:
-        file: name of the calibration file; "" = not stored.
-    """
+    """Names and hashes of the calibration's own `file` and of its map files."""
     maps = calibration.maps
     rows = [
         (label, PurePath(name).name, digest[:SHA_SHOWN])
@@ -164,7 +160,6 @@ def files(calibration: Calibration, file: str, sha256: str) -> Section:
         if name
     ]
     folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
-    text = [f"This report was made of {file}, SHA-256 {sha256}."] if file else []
-    text.append(f"Map files lay in {', '.join(folders)}." if folders else "The maps came without files.")
+    lay = f"Map files lay in {', '.join(folders)}." if folders else "The maps came without files."
     table = Table("Map files", ("map", "file", "SHA-256"), rows, textual=True)
-    return Section("Files", text, [table] if rows else [])
+    return Section("Files", [f"This report was made of {file}, SHA-256 {sha256}.", lay], [table] if rows else [])

@@ -21,25 +21,18 @@ from dm_calibration.report.pdf_pages import pdf_pages
 from dm_common.atomic_write import write_whole
 
 
-def sections(
-    calibration: Calibration, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
-) -> list[Section]:
+def sections(calibration: Calibration, file: Path, values: Mapping[str, Any] = JUDGED_BY) -> list[Section]:
     """All sections of the report of `calibration`, read from `file`; `values` of the parameters named in JUDGED_BY.
 
     Raises:
         OSError: `file` cannot be read.
     """
-    left, since = content_fit.residuals(calibration), list[str]()
-    if file is not None:
-        updates = RecalibrationManager(
-            file.parent, lambda: UpdateOptions(surprises_max=values["updates.surprises_max"])
-        )
-        updates.begin(calibration)
-        since = updates.doubts
-    log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
-    sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
+    left = content_fit.residuals(calibration)
+    updates = RecalibrationManager(file.parent, lambda: UpdateOptions(surprises_max=values["updates.surprises_max"]))
+    updates.begin(calibration)
+    log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}"))
     return [
-        certificate.certificate(calibration, certificate.people(), log, values, since),
+        certificate.certificate(calibration, certificate.people(), log, values, updates.doubts),
         certificate.every_actuator(calibration),
         Section("Appendix", ["What the two pages before rest on."]),
         *([checks.checks_section(calibration, log, values)] if log else []),
@@ -53,18 +46,14 @@ def sections(
         content_hysteresis.hysteresis(calibration),
         content_hysteresis.recipes(calibration),
         content.every_map(calibration),
-        content.files(calibration, file.name if file is not None else "", sha256),
+        content.files(calibration, file.name, hashlib.sha256(file.read_bytes()).hexdigest()),
     ]
 
 
 def write_report(
-    calibration: Calibration, folder: Path, file: Path | None = None, values: Mapping[str, Any] = JUDGED_BY
+    calibration: Calibration, folder: Path, file: Path, values: Mapping[str, Any] = JUDGED_BY
 ) -> tuple[Path, Path]:
-    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each atomically; returns the two files.
-
-    Args:
-        file: from which the calibration was read, for its SHA-256.
-        values: of the parameters named in JUDGED_BY.
+    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each atomically; returns the two files. Args as `sections`.
 
     Raises:
         OSError: `file` cannot be read, or `folder` cannot be written to.
