@@ -327,7 +327,7 @@ def test_a_run_killed_while_it_was_stored_measures_no_more(tmp_path: Path, monke
     services = SimpleNamespace(rest=lambda _signals: "", settle_time=0.0, map_time=0.0)
     handle = SimpleNamespace(request=Calibrate.Goal(), publish_feedback=lambda _feedback: None)
     manager = SimpleNamespace(known_mirror=lambda: MIRROR)
-    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, dict, handle)  # type: ignore[arg-type]
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, handle)  # type: ignore[arg-type]
     action._plan, action._mirror = POKES, MIRROR
     unmoved = SimpleNamespace(run=lambda: pytest.fail("the procedure runs again"))
     monkeypatch.setattr(action, "_opened", lambda *_: again)
@@ -346,8 +346,8 @@ def test_a_run_that_is_cancelled_while_it_is_fitted_is_kept_and_not_used(
     made = calibrate(outcome, mirror=MIRROR, provenance=Provenance("new", 1))
     services = SimpleNamespace(rest=lambda _signals: "", settle_time=0.0, map_time=0.0, cancelled=lambda: True)
     handle = SimpleNamespace(request=Calibrate.Goal(activate=True), publish_feedback=lambda _feedback: None)
-    manager = SimpleNamespace(known_mirror=lambda: MIRROR)  # which is asked to keep nothing
-    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, dict, handle)  # type: ignore[arg-type]
+    manager = SimpleNamespace(known_mirror=lambda: MIRROR, driver_facts={})  # which is asked to keep nothing
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, handle)  # type: ignore[arg-type]
     action._plan, action._mirror = POKES, MIRROR
     monkeypatch.setattr(action, "_opened", lambda *_: run)
     monkeypatch.setattr(action, "_procedure", lambda *_: SimpleNamespace(run=lambda: None))

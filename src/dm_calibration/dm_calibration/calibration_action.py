@@ -1,6 +1,6 @@
 """The body of the action `calibrate`: make a plan from the goal, run it, fit, store and publish."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from dm_msgs.action import Calibrate
@@ -26,14 +26,8 @@ from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
 
-_PHASES = {
-    StepKind.POKE: "pokes",
-    StepKind.SURFACE: "surfaces",
-    StepKind.EXCITATION: "hysteresis",
-    StepKind.IN_USE: "hysteresis",
-    StepKind.CHECK: "hysteresis",
-    StepKind.DEGAUSSED: "hysteresis",
-}
+_OF_HYSTERESIS = (StepKind.EXCITATION, StepKind.IN_USE, StepKind.CHECK, StepKind.DEGAUSSED)
+_PHASES = {StepKind.POKE: "pokes", StepKind.SURFACE: "surfaces"} | dict.fromkeys(_OF_HYSTERESIS, "hysteresis")
 
 #: How long a goal waits for a driver that was started together with this node, s.
 START_GRACE_S = 5.0
@@ -48,12 +42,10 @@ class CalibrateAction:
         values: Mapping[str, Any],
         services: BenchServices,
         manager: CalibrationManager,
-        driver_facts: Callable[[], Mapping[str, Any]],
         handle: WorkerGoal,
     ) -> None:
-        """`driver_facts` gives wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
         self._node, self._values, self._services, self._manager = node, values, services, manager
-        self._driver_facts, self._handle, self._goal = driver_facts, handle, handle.request
+        self._handle, self._goal = handle, handle.request
         self._maps_per_state = self._goal.maps_per_state or 1
         self._result = without_figures(Calibrate.Result())
         self._feedback, self._end = Calibrate.Feedback(), 0
@@ -157,7 +149,7 @@ class CalibrateAction:
             "degauss": "over the full range, steps as configured in the driver" if self._options.degauss else "none",
             "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
         }
-        identity = identity_of(plan, self._options, self._mirror, settings, self._driver_facts())
+        identity = identity_of(plan, self._options, self._mirror, settings, self._manager.driver_facts)
         age_max, fresh = self._values["resume_max_age"], self._values["start_fresh"]
         now_ns = self._node.get_clock().now().nanoseconds
         run = open_run(runs, identity, plan, age_max, fresh, now_ns, self._maps_per_state, self._goal.note)
@@ -244,7 +236,7 @@ class CalibrateAction:
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number
         result.poke_check_passed, result.poke_findings = check.passed, list(check.findings)
-        changes, beyond = poke_cure(check, mirror, outcome.records[-1], self._driver_facts().get("channels", ()))
+        changes, beyond = poke_cure(check, mirror, outcome.records[-1], self._manager.driver_facts.get("channels", ()))
         result.parameters = parameter_text(changes)
         result.poke_findings += filter(None, [beyond])
         if calibration is None:

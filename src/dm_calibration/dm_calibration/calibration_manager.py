@@ -2,10 +2,11 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
@@ -33,6 +34,7 @@ class CalibrationManager:
 
     Attributes:
         mirror: as the driver describes it; None before it did.
+        driver_facts: the driver's wiring and electronics, see :func:`~.calibration_messages.driver_facts`.
         in_use: the calibration in use; None = there is none.
     """
 
@@ -57,6 +59,7 @@ class CalibrationManager:
         # Held while a stored calibration is changed, so that no change gets lost; writing may take a while.
         self._changing = threading.Lock()
         self.mirror: Mirror | None = None
+        self.driver_facts: Mapping[str, Any] = {}
         self.in_use: Calibration | None = None
 
     def known_mirror(self, wait_s: float = 0.0) -> Mirror:
@@ -141,15 +144,11 @@ class CalibrationManager:
         if name:
             calibration = self.store.load(name)
             self.check_fits(calibration)
-        else:
-            readable = (entry.calibration for entry in self.store.entries() if entry.calibration)
-            newest = next((candidate for candidate in readable if not self.mismatch(candidate)), None)
-            if newest is None:
-                raise Refusal(
-                    ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}"
-                )
-            calibration = newest
-        return calibration, self.use(calibration)
+            return calibration, self.use(calibration)
+        for entry in self.store.entries():
+            if entry.calibration and not self.mismatch(entry.calibration):
+                return entry.calibration, self.use(entry.calibration)
+        raise Refusal(ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}")
 
     def load_last(self) -> tuple[Calibration, str]:
         """Use the calibration that the mirror used last; if that is not known or fails, the newest that fits.

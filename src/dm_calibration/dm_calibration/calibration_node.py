@@ -66,7 +66,6 @@ class CalibrationNode(ManagedNode):
             self.inactive,
         )
         self._bench_services = BenchServices(self, self._values)
-        self._driver_facts: dict[str, Any] = {}
         self._server = WorkerActionServer(
             self, Calibrate, "calibrate", self._calibrate, exclusive="refuse", fields=requests.CALIBRATE
         )
@@ -120,8 +119,7 @@ class CalibrationNode(ManagedNode):
         self._reports.end()
 
     def _calibrate(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:
-        services = self._bench_services
-        return CalibrateAction(self, self._values, services, self._manager, lambda: self._driver_facts, handle).run()
+        return CalibrateAction(self, self._values, self._bench_services, self._manager, handle).run()
 
     def _write_report(self, file: Path) -> None:
         if self._values["write_report"]:
@@ -152,7 +150,7 @@ class CalibrationNode(ManagedNode):
         except ValueError as error:
             self.get_logger().error(f"mirror_info refused: {error}")
             return
-        self._driver_facts, before = driver_facts(message), self._manager.mirror
+        self._manager.driver_facts, before = driver_facts(message), self._manager.mirror
         self._recorder.recall(mirror.serial, 1e-9 * self.get_clock().now().nanoseconds)
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
