@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorHysteresis, Capabilities, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
+from std_msgs.msg import Header
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
@@ -43,27 +44,23 @@ def calibration_message(
     calibration: Calibration | None, file: Path | None, frame_id: str, calibrated_error_max: float
 ) -> CalibrationMsg:
     """The message on `calibration`; None = no calibration. Its quality is judged by `calibrated_error_max`, m."""
-    message = CalibrationMsg()
-    message.header.frame_id = frame_id
     if calibration is None:
-        return message
+        return CalibrationMsg(header=Header(frame_id=frame_id))
     fit, points = calibration.fit, calibration.fit.points
-    message.header.stamp = time_message(calibration.stamp_ns)
-    message.file = str(file or "")
-    message.sample_x = doubles(points.x)
-    message.sample_y = doubles(points.y)
-    message.sample_weight = doubles(points.weight)
-    message.maps_used = int(fit.used.sum())
-    for source, names in ((calibration, _NAMES), (fit, _FIGURES)):
-        for name in names:
-            setattr(message, name, getattr(source, name))
-    for name in _MODEL:
-        setattr(message, name, doubles(getattr(fit, name)))
     doubtful = calibration.doubts(calibrated_error_max)
-    message.quality = Capabilities.APPROXIMATE if doubtful else Capabilities.CALIBRATED
-    message.actuator_grade = _grades(fit)
-    message.known_limitations = list(calibration.limitations)
-    message.region_weights = doubles(calibration.region_weights)
+    message = CalibrationMsg(
+        header=Header(frame_id=frame_id, stamp=time_message(calibration.stamp_ns)),
+        file=str(file or ""),
+        **taken(calibration, *_NAMES),
+        **taken(fit, *_FIGURES),
+        **{name: doubles(getattr(fit, name)) for name in _MODEL},
+        **{f"sample_{name}": doubles(getattr(points, name)) for name in ("x", "y", "weight")},
+        maps_used=int(fit.used.sum()),
+        quality=Capabilities.APPROXIMATE if doubtful else Capabilities.CALIBRATED,
+        actuator_grade=_grades(fit),
+        known_limitations=list(calibration.limitations),
+        region_weights=doubles(calibration.region_weights),
+    )
     if calibration.hysteresis is not None:
         message.hysteresis = hysteresis_message(calibration.hysteresis)
     return message
