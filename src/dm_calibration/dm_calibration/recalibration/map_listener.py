@@ -22,7 +22,7 @@ from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsabl
 from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_calibration.requests import UPDATE_CALIBRATION
-from dm_common.errors import EXPECTED, NO_CALIBRATION, ErrorCode, Refusal
+from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import qos
@@ -188,7 +188,7 @@ class MapListener:
 
         Raises:
             Refusal: a calibration is running, or the driver is silent.
-            MapNotUsableError, StoreError: see :class:`RecalibrationManager`.
+            MapNotUsableError, StoreError: see :meth:`RecalibrationManager.take`.
         """
         self._judged.append(measured)
         still = self._values["updates.still_time"]
@@ -230,14 +230,13 @@ class MapListener:
         other = "dry_run" if request.dry_run else "without"
         if request.dry_run or request.without:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"forget and {other}: only one of them may be set")
-        self._calibration()
         with self._turn:
             self._updates.forget()
         self._changed()
         response.message = "all updates are forgotten"
 
     def _check(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
-        actuators = self._calibration().fit.actuators
+        actuators = self._updates.kept().calibration.fit.actuators
         wholes([], 1, actuators, sizes=range(actuators)).check("without", request.without)
         with self._turn:
             timeout = self._values["driver_timeout"]
@@ -265,11 +264,6 @@ class MapListener:
     def _rests(self) -> bool:
         now = 1e-9 * self._node.get_clock().now().nanoseconds
         return self.history.still_for(now) >= self._values["updates.still_time"]
-
-    def _calibration(self) -> Calibration:
-        if (kept := self._updates.in_use) is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
-        return kept.calibration
 
     def health(self) -> tuple[bytes, list[str], dict[str, object]]:
         """Level, warnings and figures for the node's diagnostics."""

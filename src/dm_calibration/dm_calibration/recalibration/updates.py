@@ -22,7 +22,7 @@ from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
-from dm_common.errors import NO_CALIBRATION
+from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
@@ -135,12 +135,12 @@ class RecalibrationManager:
                 map shows them.
 
         Raises:
-            MapNotUsableError: there is no calibration, or the map cannot be compared with it, or does not show that
-                the actuators fail.
+            Refusal: no calibration is in use.
+            MapNotUsableError: the map cannot be compared with it, or does not show that the actuators fail.
             StoreError: the update could not be stored; nothing has changed.
         """
         with self._lock:
-            kept, options = self._kept(), self._options()
+            kept, options = self.kept(), self._options()
             calibration, updates = kept.calibration, kept.drift
             check_map(measured, calibration, options)
             if settled.effective.shape != (calibration.fit.actuators,):
@@ -184,21 +184,23 @@ class RecalibrationManager:
         """Drop all updates of the calibration in use.
 
         Raises:
-            MapNotUsableError: no calibration is in use.
+            Refusal: no calibration is in use.
             StoreError: the file could not be removed; nothing has changed.
         """
         with self._lock:
-            kept = self._kept()
+            kept = self.kept()
             with storing(f"updates of {kept.calibration.id} were not removed"):
                 self._file(kept.calibration.id).unlink(missing_ok=True)
             self.in_use = InUse(kept.calibration, kept.filter, kept.filter.start(kept.calibration.stamp_ns))
 
-    def _kept(self) -> InUse:
-        if (kept := self.in_use) is None:
-            raise MapNotUsableError(NO_CALIBRATION)
-        if kept.filter.options != (options := self._options()):  # live parameters have changed
-            kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, options))
-        return kept
+    def kept(self) -> InUse:
+        """What is in use, with a filter of the present options. Raises Refusal if no calibration is in use."""
+        with self._lock:
+            if (kept := self.in_use) is None:
+                raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
+            if kept.filter.options != (options := self._options()):  # live parameters have changed
+                kept = self.in_use = replace(kept, filter=DriftFilter(kept.calibration, options))
+            return kept
 
     def _file(self, identifier: str, suffix: str = SUFFIX) -> Path:
         return self.folder / f"{identifier}{suffix}"
@@ -248,15 +250,10 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             f"aperture radius {measured.radius * 1e3:.3f} mm, the calibration's is {radius * 1e3:.3f} mm "
             f"+-{tolerance:.1%}"
         )
-    if not measured.valid_fraction >= options.valid_fraction_min:
-        raise MapNotUsableError(
-            f"{measured.valid_fraction:.1%} of the pixels are valid: must be at least {options.valid_fraction_min:.1%}"
-        )
-    seen = float(np.isfinite(measured.sag) @ calibration.fit.points.weight)
-    if not seen >= options.valid_fraction_min:
-        raise MapNotUsableError(
-            f"{seen:.1%} of the sampled area has data: must be at least {options.valid_fraction_min:.1%}"
-        )
+    seen, least = float(np.isfinite(measured.sag) @ calibration.fit.points.weight), options.valid_fraction_min
+    for share, text in ((measured.valid_fraction, "the pixels are valid"), (seen, "the sampled area has data")):
+        if not share >= least:
+            raise MapNotUsableError(f"{share:.1%} of {text}: must be at least {least:.1%}")
     if measured.stamp_ns <= calibration.stamp_ns:
         early = 1e-9 * (calibration.stamp_ns - measured.stamp_ns)
         raise MapNotUsableError(f"stamp {early:.3f} s before the calibration was finished: must be after that")
