@@ -31,6 +31,9 @@ ROUNDS = 20
 SETTLED = 1e-6
 #: Ridge on the gains, relative to the trace of their normal matrix: keeps it regular where actuators hardly move.
 SOLVABLE = 1e-13
+#: Guess, bounds and scale of the first coefficient of a slope, of each further one, and of the creep rate.
+FIRST_SLOPE, FURTHER_SLOPE = (1.5, -30.0, 30.0, 1.0), (0.0, -30.0, 30.0, 1.0)
+CREEP_RATE = (0.01, 0.0, CREEP_RATE_MAX, 0.01)
 #: Most evaluations of the Gauss-Newton iteration: from a guess; from a fit to other rows (its result and one step).
 EVALUATIONS, EVALUATIONS_AGAIN = 20, 2
 #: Creep is set to 0 if it lowers the sum of squares, in units of the scatter, by less than CREEP_SHOWN or, without
@@ -73,14 +76,14 @@ class Candidate:
         return np.concatenate(([0.0], (np.arange(self.plays) + 0.5) / max(self.plays, 1)))
 
 
-PREISACH, PREISACH_AND_DUHEM = Candidate("Preisach", 20, 3, 0), Candidate("Preisach and Duhem", 20, 3, 4)
+PREISACH = Candidate("Preisach", 20, 3, 0)
 CANDIDATES = (
     Candidate("linear", 0, 1, 0),
     Candidate("static", 0, 3, 0),
     Candidate("Prandtl-Ishlinskii", 20, 1, 0),
     PREISACH,
     Candidate("Duhem", 0, 3, 4),
-    PREISACH_AND_DUHEM,
+    Candidate("Preisach and Duhem", 20, 3, 4),
     Candidate("static, each actuator its own", 0, 5, 0, own=True),
     Candidate("Preisach, each actuator its own", 30, 10, 0, own=True),
     Candidate("Preisach and Duhem, each actuator its own", 30, 10, 4, own=True),
@@ -108,8 +111,7 @@ class CandidateProblem:
 
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
-        self.radius = candidate.radius
-        self._plays = run.along(lambda signals: play_features(signals, self.radius, candidate.powers, run.rest))
+        self._plays = run.along(lambda signals: play_features(signals, candidate.radius, candidate.powers, run.rest))
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
         self._scatter = scatter
         self._measured = run.responses.values / scatter
@@ -120,11 +122,10 @@ class CandidateProblem:
         Args:
             evaluations: most evaluations of the residual; None = EVALUATIONS or EVALUATIONS_AGAIN.
         """
-        slopes = self.candidate.slopes
-        if start is None:
-            guess = np.concatenate((np.full(min(slopes, 1), 1.5), np.zeros(max(slopes - 1, 0)), [0.01]))
-        else:
-            guess = np.concatenate((start.law.duhem_slope, [start.law.creep_rate]))
+        slopes = [FIRST_SLOPE, *[FURTHER_SLOPE] * (self.candidate.slopes - 1)] if self.candidate.slopes else []
+        guess, low, high, scale = np.array([*slopes, CREEP_RATE]).T
+        if start is not None:
+            guess = np.append(start.law.duhem_slope, start.law.creep_rate)
         weights: list[Floats | None] = [None]
 
         def residual(nonlinear: Floats) -> Floats:
@@ -135,9 +136,6 @@ class CandidateProblem:
             weights[0], left = self._solve(features, keep, weights[0])
             return np.asarray(left[keep].ravel())
 
-        low = np.concatenate((np.full(slopes, -30.0), [0.0]))
-        high = np.concatenate((np.full(slopes, 30.0), [CREEP_RATE_MAX]))
-        scale = np.concatenate((np.ones(slopes), [0.01]))
         found = least_squares(
             residual,
             guess,
@@ -177,10 +175,10 @@ class CandidateProblem:
         return weights, left / self._scatter
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
-        plays = len(self.radius) * self.candidate.powers
+        radius, plays = self.candidate.radius, self._plays.shape[1]
         law = HysteresisModel(
-            self.radius,
-            weights[:plays].reshape(len(self.radius), self.candidate.powers),
+            radius,
+            weights[:plays].reshape(len(radius), -1),
             nonlinear[:-1].copy(),
             float(weights[plays]) if self.candidate.slopes else 0.0,
             float(nonlinear[-1]),

@@ -174,17 +174,21 @@ def weight_of(rate: float) -> float:
     return max(rate, RATE_MIN) * PER_ELEMENT
 
 
+def smoothness(count: int, correlation: float) -> Floats:
+    """(count, count) correlation of a smooth spectrum: falls to 1/e over `correlation` elements."""
+    number = np.arange(count)
+    return np.asarray(np.exp(-np.abs(np.subtract.outer(number, number)) / correlation))
+
+
 def spectrum_prior(rate: float, spread: float, correlation: float) -> Floats:
     """(J, J) prior covariance of the weights of the creep elements.
 
     Args:
         rate: creep rate of the law.
         spread: standard deviation relative to the weight expected for `rate`.
-        correlation: number of elements over which the correlation falls to 1/e.
+        correlation: see :func:`smoothness`.
     """
-    number = np.arange(len(CREEP_TIMES))
-    apart = np.abs(np.subtract.outer(number, number))
-    return np.asarray((spread * weight_of(rate)) ** 2 * np.exp(-apart / correlation))
+    return (spread * weight_of(rate)) ** 2 * smoothness(len(CREEP_TIMES), correlation)
 
 
 def relaxation(time: Floats, start: float) -> Floats:

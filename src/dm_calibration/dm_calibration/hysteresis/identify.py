@@ -116,9 +116,6 @@ def identify(
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
 
-    def size(residual: Floats) -> float:
-        return _size(run, residual[train])
-
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
         name = problem.candidate.name
@@ -131,7 +128,7 @@ def identify(
         if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
             refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not tell its creep"
             return
-        gain = size(best[2].residual) / size(whole.residual) if best else np.inf
+        gain = _size(run, best[2].residual[train]) / _size(run, whole.residual[train]) if best else np.inf
         if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
             scores[name] = best[0]  # it hardly fits its own maps better, so it will not predict better
         else:
@@ -139,7 +136,7 @@ def identify(
             for fold in range(folds):
                 left_out = train & (part == fold)
                 held_out[left_out] = problem.fit(train & ~left_out, whole).residual[left_out]
-            scores[name] = size(held_out)
+            scores[name] = _size(run, held_out[train])
             if best is None or PARSIMONY * scores[name] < best[0]:
                 best = (scores[name], problem, whole, held_out)
         refused.pop(name, None)

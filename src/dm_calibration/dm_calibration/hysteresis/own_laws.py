@@ -30,6 +30,7 @@ from dm_calibration.hysteresis.features import (
     padded_slope,
     pattern_basis,
     play_values,
+    smoothness,
     spectrum_prior,
     weight_of,
 )
@@ -103,20 +104,14 @@ class OwnLaws:
     """
 
     def __init__(
-        self,
-        run: Run,
-        candidate: Candidate,
-        common: HysteresisModel,
-        scatter: Floats,
-        slope_min: float,
+        self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, slope_min: float
     ) -> None:
-        self.run, self._scatter, self._slope, self._slope_min = run, scatter, common.duhem_slope, slope_min
-        self.candidate = candidate
-        self.radius = candidate.radius
-        self._basis = pattern_basis(self.radius, candidate.powers)
+        self.run, self.candidate, self._scatter, self._slope_min = run, candidate, scatter, slope_min
+        self._slope = common.duhem_slope
+        radius, orders = candidate.radius, candidate.powers
+        self._basis = pattern_basis(radius, orders)
         signals = run.signals - run.rest
-        values = run.along(lambda signals: play_values(signals, self.radius, run.rest))
-        orders = candidate.powers
+        values = run.along(lambda signals: play_values(signals, radius, run.rest))
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.full(1, run.rest), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
@@ -127,18 +122,16 @@ class OwnLaws:
         #: Feature ranges: the patterns of the play operators, and the linear Duhem operators.
         first = 1 + self._basis.shape[1]
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
-        count = signals.shape[1]
         self.spread: float | None = None
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)
-        prior_of_creep = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
-        number = np.arange(LAGS)
-        lag = LAG**2 * np.exp(-np.abs(np.subtract.outer(number, number)) / SPECTRUM_CORRELATION)
-        prior = block_diag(prior_of_creep, lag, CREEP_SLOPE**2)
+        elements = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
+        lag = LAG**2 * smoothness(LAGS, SPECTRUM_CORRELATION)
+        prior = block_diag(elements, lag, CREEP_SLOPE**2)
         self._creep_root = np.asarray(np.linalg.cholesky(prior), dtype=np.float64)
         self._signal_states = self.run.creep_states(signals)
-        self._creep_between = alike(count, SPECTRUM_SPREAD)
+        self._creep_between = alike(signals.shape[1], SPECTRUM_SPREAD)
 
     def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
         """Fit to the rows in `keep` (M,), from `start`, whose Duhem operators are kept, or from no hysteresis."""
@@ -226,8 +219,8 @@ class OwnLaws:
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
         """The law with the weights `patterns` (F, N) and `creep` (J + L + 1, N)."""
-        orders = self.candidate.powers
-        series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(self.radius), orders)
+        radius, orders = self.candidate.radius, self.candidate.powers
+        series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(radius), orders)
         powers = [
             np.pad(legendre.leg2poly([0.0] * order + [1.0]), (0, orders - order)) for order in range(1, orders + 1)
         ]
@@ -238,7 +231,7 @@ class OwnLaws:
         mean = float(share.mean())
         share[:, :LAGS] += lag
         law = HysteresisModel(
-            self.radius,
+            radius,
             play_weight,
             slope,
             patterns[-1].copy() if slope.size else 0.0,
