@@ -10,11 +10,12 @@ count for less, by as much as their residual exceeds independent errors along th
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from dm_calibration.hysteresis.features import spectrum_prior
 from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_common import Floats
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT
 
 #: Prior of the element weights that all actuators share: standard deviation relative to the mean weight, and
@@ -76,6 +77,4 @@ def _posterior(evidence: Floats, prior: Floats) -> Floats:
 
 def _prior(law: HysteresisModel, spectrum: float, correlation: float, position: float) -> Floats:
     """(1 + J, 1 + J) covariance of the weights of position and creep elements, relative to those of `law`."""
-    prior = np.zeros((1 + len(CREEP_TIMES),) * 2)
-    prior[0, 0], prior[1:, 1:] = position**2, spectrum_prior(law.creep_rate, spectrum, correlation)
-    return prior
+    return np.asarray(block_diag(position**2, spectrum_prior(law.creep_rate, spectrum, correlation)))

@@ -42,17 +42,7 @@ def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
 
 
 def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.0) -> Floats:
-    """Powers of the values of play operators along a sequence that begins demagnetised, less their values at rest.
-
-    Args:
-        signals: (M, N).
-        radius: (R,) half-widths.
-        powers: D.
-        rest: signal at which they begin.
-
-    Returns:
-        (M, R D, N), the powers of one half-width beside each other.
-    """
+    """(M, R D, N) powers 1 .. D of :func:`play_values`, less those at rest; those of one half-width stand together."""
     values = play_values(signals, radius, rest)
     stacked = np.stack([values**power - rest**power for power in range(1, powers + 1)], axis=2)
     return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
@@ -181,10 +171,9 @@ def smoothness(count: int, correlation: float) -> Floats:
 
 
 def spectrum_prior(rate: float, spread: float, correlation: float) -> Floats:
-    """(J, J) prior covariance of the weights of the creep elements.
+    """(J, J) prior covariance of the weights of the creep elements of a law with the creep rate `rate`.
 
     Args:
-        rate: creep rate of the law.
         spread: standard deviation relative to the weight expected for `rate`.
         correlation: see :func:`smoothness`.
     """
@@ -199,15 +188,10 @@ def relaxation(time: Floats, start: float) -> Floats:
 def follow(
     law: HysteresisModel, state: HysteresisState, signals: Floats, time: Floats, moved: Floats | None = None
 ) -> tuple[Floats, HysteresisState]:
-    """Effective signals of a sequence, observed at `time`.
+    """(M, N) effective signals of `signals` (M, N), observed at `time` (M,) s, and the state after the last.
 
     Args:
-        signals: (M, N) as applied.
-        time: (M,) s, rising.
         moved: (M,) s, when each was applied, between the observations; None = right after the one before.
-
-    Returns:
-        (M, N) effective signals, and the state after the last.
 
     Raises:
         ValueError: time stamps that run backwards.

@@ -87,11 +87,9 @@ def recipes_figure(book: RecipeBook) -> Figure:
     figure = Figure(figsize=(10.5, 3.2), layout="constrained")
     axes = figure.add_subplot()
     curvature = [recipe.curvature for recipe in book.recipes]
-    for values, colour, marker, label in (
-        ([recipe.max_zernike for recipe in book.recipes], BLUE, "o", "largest coefficient error"),
-        ([recipe.rms for recipe in book.recipes], ORANGE, "s", "rms sag error"),
-    ):
-        axes.plot(curvature, np.array(values) * NM, marker, color=colour, label=label)
+    largest, rms = np.array([(recipe.max_zernike, recipe.rms) for recipe in book.recipes]).T * NM
+    axes.plot(curvature, largest, "o", color=BLUE, label="largest coefficient error")
+    axes.plot(curvature, rms, "s", color=ORANGE, label="rms sag error")
     axes.set(xlabel="curvature, 1/m (concave positive)", ylabel="re-measured error, nm", ylim=(0, None))
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)

@@ -69,16 +69,10 @@ def influence_sheet(calibration: Calibration) -> Figure:
         outside = distance > radius
         x, y = centre + (place * radius / distance if outside else place)
         axes.plot(x, y, "x" if outside else "o", color="black", markersize=3, markerfacecolor="none")
-        good = fit.grades[number] == GRADE_GOOD
-        axes.text(
-            centre[0],
-            top + 0.1 * radius,
-            f"{number + 1}: {GRADE_NAMES[fit.grades[number]]}",
-            fontsize=8,
-            ha="center",
-            color="black" if good else VERMILION,
-            fontweight="normal" if good else "bold",
-        )
+        grade = fit.grades[number]
+        emphasis = {} if grade == GRADE_GOOD else {"color": VERMILION, "fontweight": "bold"}
+        label = f"{number + 1}: {GRADE_NAMES[grade]}"
+        axes.text(centre[0], top + 0.1 * radius, label, fontsize=8, ha="center", **emphasis)
     ticks = np.array([-0.5, 0.0, 0.5]) * radius
     labels = [f"{tick:.3g}" for tick in ticks]
     axes.set_xticks((columns[:, None] + ticks).ravel(), labels * COLUMNS, fontsize=6.5)
@@ -105,18 +99,13 @@ def response_figure(calibration: Calibration) -> Figure:
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
     left.legend(fontsize=8)
     left.grid(axis="y", alpha=0.3)
-    shown = right.scatter(
-        calibration.actuator_x * MM, calibration.actuator_y * MM, c=fit.response * NM, s=170, cmap="cividis"
-    )
-    bad = ~good
-    ring = {"s": 300, "facecolors": "none", "edgecolors": VERMILION, "linewidths": 2}
-    right.scatter(calibration.actuator_x[bad] * MM, calibration.actuator_y[bad] * MM, **ring)
+    x, y = calibration.actuator_x * MM, calibration.actuator_y * MM
+    shown = right.scatter(x, y, c=fit.response * NM, s=170, cmap="cividis")
+    right.scatter(x[~good], y[~good], s=300, facecolors="none", edgecolors=VERMILION, linewidths=2)
     middle = 0.5 * (fit.response.min() + fit.response.max())
-    for number, x, y, response in zip(
-        numbers, calibration.actuator_x * MM, calibration.actuator_y * MM, fit.response, strict=True
-    ):
+    for number, response in enumerate(fit.response):
         colour = "white" if response < middle else "black"
-        right.text(x, y, str(number), fontsize=6.5, ha="center", va="center", color=colour)
+        right.text(x[number], y[number], str(number + 1), fontsize=6.5, ha="center", va="center", color=colour)
     right.add_patch(Circle((0, 0), calibration.aperture_radius * MM, fill=False, edgecolor=GREY, linestyle="--"))
     right.set(aspect="equal", xlabel="x, mm", ylabel="y, mm")
     right.margins(0.12)
