@@ -175,8 +175,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         points = SamplePoints(*(np.asarray(columns[f"points/{name}"], dtype=np.float64) for name in _POINTS))
         # Older files lack the time of the last move, the segment of the run and the temperature: not known.
         unknown = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
-        before = {"moved_ns": unknown, "segment": unknown, "temperature": np.full(len(unknown), np.nan)}
-        columns = {f"maps/{name}": value for name, value in before.items()} | dict(columns)
+        before = {"maps/moved_ns": unknown, "maps/segment": unknown, "maps/temperature": np.full(len(unknown), np.nan)}
+        columns = before | dict(columns)
         raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
         # Older files hold nothing on the instrument's own error: not known.
@@ -251,7 +251,7 @@ def _check_result(calibration: Calibration) -> None:
         raise CalibrationFileError(f"regions/weights: must be {len(AREA_FRACTIONS)} numbers above 0, at most 1")
     if any(recipe.effective.shape != (n,) for recipe in calibration.recipes.recipes):
         raise CalibrationFileError(f"recipes/effective: must have {n} signals each")
-    for name in ("x", "y", "weight"):
+    for name in _POINTS:
         if not np.isfinite(getattr(maps.points, name)).all():
             raise CalibrationFileError(f"points/{name} holds values that are not finite")
     if not calibration.aperture_radius > 0.0:

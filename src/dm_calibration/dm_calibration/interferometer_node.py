@@ -19,7 +19,6 @@ from dm_msgs.srv import IngestFile, Measure
 from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -33,7 +32,7 @@ from dm_calibration.map_files.datx_structure import as_text
 from dm_calibration.optics.orientation import Orientation
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
-from dm_common.messages import stamp_ns
+from dm_common.messages import stamp_ns, time_message
 from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Health, ManagedNode
@@ -240,9 +239,7 @@ class InterferometerNode(ManagedNode):
         return int(self.get_clock().now().nanoseconds)
 
     def _header(self, stamp_ns: int) -> Header:
-        return Header(
-            stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=parameters.frame_id(self, self._values["frame_id"])
-        )
+        return Header(stamp=time_message(stamp_ns), frame_id=parameters.frame_id(self, self._values["frame_id"]))
 
     def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()
