@@ -100,18 +100,18 @@ def certificate(
     low, high, predicted = spheres(calibration)
     until, reason = valid_until(checks, calibration.promise, calibration.stamp_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
-    reach = "neither flat nor mid range is within reach"
+    reach, foretold, farthest = "neither flat nor mid range is within reach", "not known", 0.0
     if np.isfinite(low):
-        reach = curvatures_text(low, high, 3)
-    farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
-    within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
-    usual = f"largest coefficient error within {within} for half the spheres in the range"
+        reach, farthest = curvatures_text(low, high, 3), max((low, high), key=abs)
+        within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
+        usual = f"largest coefficient error within {within} for half the spheres in the range"
+        foretold = f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"),
-        ("predicted", f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends" if np.isfinite(low) else "not known"),
+        ("predicted", foretold),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),

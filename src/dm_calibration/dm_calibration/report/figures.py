@@ -1,6 +1,7 @@
 """Figures of the report: influence functions, residuals, regions, coefficients. Lengths in m; drawn in mm and nm."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import Normalize
@@ -70,7 +71,7 @@ def influence_sheet(calibration: Calibration) -> Figure:
         x, y = centre + (place * radius / distance if outside else place)
         axes.plot(x, y, "x" if outside else "o", color="black", markersize=3, markerfacecolor="none")
         grade = fit.grades[number]
-        emphasis = {} if grade == GRADE_GOOD else {"color": VERMILION, "fontweight": "bold"}
+        emphasis: dict[str, Any] = {} if grade == GRADE_GOOD else {"color": VERMILION, "fontweight": "bold"}
         label = f"{number + 1}: {GRADE_NAMES[grade]}"
         axes.text(centre[0], top + 0.1 * radius, label, fontsize=8, ha="center", **emphasis)
     ticks = np.array([-0.5, 0.0, 0.5]) * radius
