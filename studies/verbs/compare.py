@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, as_wavelengths, console, progress_bar, write_json
 
 #: Options by the option that selects their table, "" = no such option; `seed` and `json` go with all.
 TABLES = {
@@ -37,15 +37,15 @@ def figures_of(comparison: Any) -> dict[str, Any]:
     return {
         "methods": {
             name: {
-                "p50_nm": nanometres(row.p50),
-                "p90_nm": nanometres(row.p90),
+                "p50_nm": 1e9 * row.p50,
+                "p90_nm": 1e9 * row.p90,
                 "rms_pct_pv": 100.0 * row.rms_share,
                 "maps": row.maps,
                 "seconds": row.seconds,
             }
             for name, row in comparison.rows().items()
         },
-        "fitting_limit_nm": nanometres(comparison.fitting_limit),
+        "fitting_limit_nm": 1e9 * comparison.fitting_limit,
         "fitting_limit_pct_pv": 100.0 * comparison.fitting_limit_share,
     }
 
@@ -75,9 +75,9 @@ def show(comparison: Any) -> None:
             table.add_section()
         table.add_row(
             name.removesuffix(CLOSED) + (", closed loop" if name.endswith(CLOSED) else ""),
-            f"{nanometres(row.p50):.2f}",
+            f"{1e9 * row.p50:.2f}",
             as_wavelengths(row.p50),
-            f"{nanometres(row.p90):.2f}",
+            f"{1e9 * row.p90:.2f}",
             as_wavelengths(row.p90),
             f"{100 * row.rms_share:.2f}",
             f"{row.maps:g}",
@@ -85,7 +85,7 @@ def show(comparison: Any) -> None:
         )
     console.print(table)
     console.print(
-        f"fitting limit of this mirror, best possible command: {nanometres(comparison.fitting_limit):.1f} nm rms for "
+        f"fitting limit of this mirror, best possible command: {1e9 * comparison.fitting_limit:.1f} nm rms for "
         f"the hardest sphere, {100 * comparison.fitting_limit_share:.2f} % of PV in the median"
     )
 
@@ -185,7 +185,7 @@ def compare(
         "creep_per_decade": creep,
         "creep_foreseen": list(comparison.creep_rates),
         "max_maps": max_maps,
-        "tolerance_nm": nanometres(options.loop.tolerance),
+        "tolerance_nm": 1e9 * options.loop.tolerance,
     } | figures_of(comparison)
     write_json(json, figures | {"seconds": time.monotonic() - started})
     console.print(f"done in {time.monotonic() - started:.0f} s")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
+from dm_tools.output import as_wavelengths, console, progress_bar
 
 
 def run(plants: Sequence[str], seeds: Sequence[int], simulation: Any, quick: bool) -> Any:
@@ -39,14 +39,14 @@ def rows_of(ablation: Any) -> list[dict[str, Any]]:
                 "history": series.history,
                 "dwell_s": dwell,
                 "requests": figures.requests,
-                "p50_nm": nanometres(figures.p50),
-                "p90_nm": nanometres(figures.p90),
+                "p50_nm": 1e9 * figures.p50,
+                "p90_nm": 1e9 * figures.p90,
                 "rms_pct_pv": 100.0 * figures.rms_share,
                 "rms_pct_pv_beyond_fitting_limit": 100.0 * figures.excess_share,
                 "bound_coverage": figures.bound_coverage,
             }
             if dwell is None:
-                row["hold_1h_nm"] = nanometres(float(series.hold_1h.max()))
+                row["hold_1h_nm"] = 1e9 * float(series.hold_1h.max())
             rows.append(row)
     return rows
 
@@ -58,7 +58,7 @@ def identified_of(ablation: Any) -> list[dict[str, Any]]:
             "plant": found.plant,
             "seed": found.seed,
             "law": found.law,
-            "held_out_max_zernike_nm": nanometres(found.held_out_max_zernike),
+            "held_out_max_zernike_nm": 1e9 * found.held_out_max_zernike,
         }
         for found in ablation.identified
     ]
@@ -97,5 +97,5 @@ def show(ablation: Any) -> None:
     for found in ablation.identified:
         console.print(
             f"{found.plant}, seed {found.seed}: {found.law}, "
-            f"{nanometres(found.held_out_max_zernike):.2f} nm expected of held-out moves (95 %)"
+            f"{1e9 * found.held_out_max_zernike:.2f} nm expected of held-out moves (95 %)"
         )

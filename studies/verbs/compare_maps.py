@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
+from dm_tools.output import as_wavelengths, console, progress_bar
 from studies.verbs.compare_mirrors import WORKERS_MAX
 
 
@@ -25,7 +25,7 @@ def run(seeds: Sequence[int], maps: Sequence[int], pixels: int = 236) -> list[di
         for one in judge_all(seeds, maps, pixels, min(WORKERS_MAX, os.cpu_count() or 1)):
             found.append(one)
             bar.update(task, advance=1)
-            end = one.failure or f"95 % within {nanometres(one.requests.quantile(0.95)):.2f} nm"
+            end = one.failure or f"95 % within {1e9 * one.requests.quantile(0.95):.2f} nm"
             bar.console.print(f"seed {one.seed}, {one.method}, {one.maps} maps: {end}", highlight=False)
     of = {key: [one for one in found if (one.method, one.maps) == key] for key in product(METHODS, maps)}
     return [row_of(of[method, count], method, count) for count in maps for method in METHODS]
@@ -36,7 +36,7 @@ def row_of(judged: Sequence[Any], method: str, maps: int) -> dict[str, Any]:
     from studies.comparison.few_maps import GOAL
 
     served = sorted((one for one in judged if len(one.requests.error)), key=lambda one: one.seed)
-    reached = [nanometres(one.requests.quantile(0.95)) for one in served]
+    reached = [1e9 * one.requests.quantile(0.95) for one in served]
     return {
         "method": method,
         "maps": maps,
@@ -45,7 +45,7 @@ def row_of(judged: Sequence[Any], method: str, maps: int) -> dict[str, Any]:
         "p95_nm": {one.seed: value for one, value in zip(served, reached, strict=True)},
         "median_nm": float(np.median(reached)) if reached else None,
         "worst_nm": max(reached, default=None),
-        "good": sum(value <= nanometres(GOAL) for value in reached),
+        "good": sum(value <= 1e9 * GOAL for value in reached),
         "inside": min((one.requests.coverage for one in served), default=None),
         "failures": {one.seed: one.failure or one.requests.refusals[0] for one in judged if one not in served},
     }

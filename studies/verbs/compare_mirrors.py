@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dm_common.figures import with_wavelengths
-from dm_tools.output import WAVELENGTH, as_wavelengths, console, nanometres, progress_bar
+from dm_tools.output import WAVELENGTH, as_wavelengths, console, progress_bar
 
 #: Largest number of processes: a mirror takes a core and some 300 MB.
 WORKERS_MAX = 2
@@ -33,7 +33,7 @@ def run(seeds: Sequence[int], quick: bool) -> list[Any]:
         for outcome in judge_population(seeds, options, workers):
             outcomes.append(outcome)
             seed, order = outcome.mirror.simulation.seed, outcome.groups.get(ANY_ORDER)
-            found = f"p90 {nanometres(order.quantile(0.9)):.2f} nm, {order.coverage:.0%} inside" if order else "failed"
+            found = f"p90 {1e9 * order.quantile(0.9):.2f} nm, {order.coverage:.0%} inside" if order else "failed"
             bar.update(task, advance=1, description=f"mirrors: seed {seed}")
             bar.console.print(f"seed {seed}: {outcome.mirror.description()}: {found}", highlight=False)
     return outcomes
@@ -48,7 +48,7 @@ def row_of(outcome: Any) -> dict[str, Any]:
         "plant": mirror.simulation.law,
         "changes": mirror.changes,
         "law": outcome.law,
-        "held_out_max_zernike_nm": _number(nanometres(outcome.held_out)),
+        "held_out_max_zernike_nm": _number(1e9 * outcome.held_out),
         "curvature_range": [_number(curvature) for curvature in outcome.curvatures],
         "failure": outcome.failure,
         "calibration_s": outcome.seconds[0],
@@ -57,10 +57,10 @@ def row_of(outcome: Any) -> dict[str, Any]:
     for name, requests in outcome.groups.items():
         row[name.replace(" ", "_")] = {
             "requests": len(requests.error),
-            "p50_nm": _number(nanometres(requests.quantile(0.5))),
-            "p90_nm": _number(nanometres(requests.quantile(0.9))),
-            "max_nm": _number(nanometres(requests.quantile(1.0))),
-            "bound_p50_nm": _number(nanometres(float(np.median(requests.upper)))) if len(requests.upper) else None,
+            "p50_nm": _number(1e9 * requests.quantile(0.5)),
+            "p90_nm": _number(1e9 * requests.quantile(0.9)),
+            "max_nm": _number(1e9 * requests.quantile(1.0)),
+            "bound_p50_nm": _number(1e9 * float(np.median(requests.upper))) if len(requests.upper) else None,
             "bound_coverage": _number(requests.coverage),
             "refusals": list(requests.refusals),
         }

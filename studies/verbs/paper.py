@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, console, progress_bar, write_json
 
 
 def show(results: Any) -> None:
@@ -28,7 +28,7 @@ def show(results: Any) -> None:
             model,
             f"{regression.table2.adjusted_r2:.3f}",
             f"{reported.TABLE_2[model].adj_r2:.3f}",
-            f"{nanometres(regression.table2.leave_one_out_rms):.2f}",
+            f"{1e9 * regression.table2.leave_one_out_rms:.2f}",
             f"{100 * np.nanmax(relative_errors(regression)):.2f}",
             f"{max(pair[model].rel_err_pct for pair in reported.TABLE_3.values()):.2f}",
         )
@@ -55,7 +55,7 @@ def _show_control(results: Any) -> None:
             if method == BY_ORDER:
                 table.add_row(
                     f"{name}, {reading}",
-                    f"{nanometres(float(np.median(series.true_max_zernike))):.2f}",
+                    f"{1e9 * float(np.median(series.true_max_zernike)):.2f}",
                     *(f"{series.share_within(mark):.0%}" for mark in MARKS),
                     f"{np.mean([shot.maps for shot in series.shots]):.1f}",
                 )
@@ -71,7 +71,7 @@ def _show_sampling(results: Any) -> None:
         table.add_column(heading, justify="right")
     for name, way in results.sampling.results.items():
         lengths = (way.bias_rms, way.noise_rms, way.rim_ringing_rms)
-        table.add_row(name, f"{way.samples}", *(f"{nanometres(length):.3f}" for length in lengths))
+        table.add_row(name, f"{way.samples}", *(f"{1e9 * length:.3f}" for length in lengths))
     console.print(table)
 
 

@@ -164,15 +164,10 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     console.print(f"figures: {path}")
 
 
-def nanometres(length: float) -> float:
-    """A length in nm, for screens and reports."""
-    return length * 1e9
-
-
 def figures(message: Any, *names: str) -> dict[str, Any]:
     """Fields of `message` for JSON; a name that ends in `_nm` means the field without this suffix, in nanometres."""
     fields = {name: getattr(message, name.removesuffix("_nm")) for name in names}
-    return {name: nanometres(value) if name.endswith("_nm") else value for name, value in fields.items()}
+    return {name: 1e9 * value if name.endswith("_nm") else value for name, value in fields.items()}
 
 
 def as_wavelengths(length: float) -> str:

@@ -14,7 +14,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import rms_beyond_tilt
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
-from dm_tools.console.view_models import NM, poke_signals, prediction_text
+from dm_tools.console.view_models import poke_signals, prediction_text
 from dm_tools.long_actions import warning_in
 
 #: Wait between a command and its map, s: the default of the calibration's `settle_time`.
@@ -47,7 +47,7 @@ async def converge(session: Session, request: FocusRequest) -> str:
     """Correct the command on the interferometer until the surface is right."""
     result = await session.run("converge", Converge.Goal(request=request))
     session.base = None
-    figures = f"{result.residual_rms * NM:.1f} nm rms, largest coefficient {result.max_zernike * NM:.2f} nm"
+    figures = f"{result.residual_rms * 1e9:.1f} nm rms, largest coefficient {result.max_zernike * 1e9:.2f} nm"
     return f"{figures}, {result.maps} maps"
 
 
@@ -69,7 +69,7 @@ async def measure(session: Session, label: str = "console") -> str:
     """Take one map."""
     answer = await session.ros.call("measure", Measure.Request(label=label), math.inf)
     rms = rms_beyond_tilt(answer.zernike.coefficients, answer.zernike.residual_rms)
-    return f"rms beyond tilt {rms * NM:.1f} nm, valid {100 * answer.info.valid_fraction:.1f} % of the aperture"
+    return f"rms beyond tilt {rms * 1e9:.1f} nm, valid {100 * answer.info.valid_fraction:.1f} % of the aperture"
 
 
 async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
@@ -78,7 +78,7 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
     findings = "".join(f" Poke check: {sentence}." for sentence in result.poke_findings)
     if result.poke_check_passed:
         findings = " Poke check passed: wiring and orientation are as configured."
-    made = f"{result.id}: held-out residual {result.held_out_rms * NM:.1f} nm rms. " if result.id else ""
+    made = f"{result.id}: held-out residual {result.held_out_rms * 1e9:.1f} nm rms. " if result.id else ""
     return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings} {warning_in(result)}".rstrip()
 
 

@@ -14,7 +14,6 @@ from dm_common import Floats
 from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 
-NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
 SIGMAS_95 = 1.96
 #: Largest number of recipes in one run.
@@ -171,9 +170,9 @@ def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Ba
     return [
         Bar(
             name=f"{SPOKEN[k].replace('secondary', '2nd')} {NAMES[k].split()[0].replace('_', '').replace('^', ',')}",
-            value_nm=float(shown[k]) * NM,
-            reach_nm=float(reach[k]) * NM,
-            predicted_nm=float(marked[k]) * NM if marked is not None else None,
+            value_nm=float(shown[k]) * 1e9,
+            reach_nm=float(reach[k]) * 1e9,
+            predicted_nm=float(marked[k]) * 1e9 if marked is not None else None,
         )
         for k in range(PISTON_TILT, len(NAMES))
     ]
@@ -190,9 +189,9 @@ def reachable(capabilities: Any) -> tuple[float, float] | None:
 def prediction_text(state: Any) -> str:
     """A dm_msgs/FocusState's prediction as a sentence."""
     text = (
-        f"Predicted residual {state.predicted_rms * NM:.1f} nm rms "
-        f"(95 %: {state.predicted_rms_lower * NM:.1f} to {state.predicted_rms_upper * NM:.1f} nm), "
-        f"largest coefficient error below {state.predicted_max_zernike_upper * NM:.1f} nm"
+        f"Predicted residual {state.predicted_rms * 1e9:.1f} nm rms "
+        f"(95 %: {state.predicted_rms_lower * 1e9:.1f} to {state.predicted_rms_upper * 1e9:.1f} nm), "
+        f"largest coefficient error below {state.predicted_max_zernike_upper * 1e9:.1f} nm"
     )
     if state.predicted_duration > 0:
         text += f", shape stands after {state.predicted_duration:.2f} s"
@@ -252,14 +251,14 @@ def calibration_text(calibration: Any) -> list[str]:
         return ["No calibration is in use."]
     lines = [
         f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}, {calibration.maps_used} maps.",
-        f"Held out: {calibration.held_out_rms * NM:.2f} nm rms, largest coefficient error "
-        f"{calibration.held_out_max_zernike * NM:.2f} nm.",
+        f"Held out: {calibration.held_out_rms * 1e9:.2f} nm rms, largest coefficient error "
+        f"{calibration.held_out_max_zernike * 1e9:.2f} nm.",
     ]
     law = calibration.hysteresis
     if law.play_radius:
         lines.append(
             f"Hysteresis: {law.law}; creep {law.creep_rate:.2%} per decade; held-out "
-            f"moves to {law.held_out_max_zernike * NM:.2f} nm."
+            f"moves to {law.held_out_max_zernike * 1e9:.2f} nm."
         )
     if calibration.revision:
         lines.append(f"Maps that updated it since: {calibration.revision}.")

@@ -18,16 +18,7 @@ from dm_tools.demo.demo_bench import (
     usable_folder,
     wait_for_calibration,
 )
-from dm_tools.output import (
-    WAVELENGTH,
-    JsonOption,
-    as_wavelengths,
-    console,
-    nanometres,
-    next_step,
-    progress_bar,
-    write_json,
-)
+from dm_tools.output import WAVELENGTH, JsonOption, as_wavelengths, console, next_step, progress_bar, write_json
 
 #: Default number of maps for the identification of hysteresis and creep.
 MAPS = 200
@@ -48,13 +39,13 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
         answer = client.ingest(str(path.resolve()))
     console.print(
         f"real map [bold]{path.name}[/]: {answer.info.width} x {answer.info.height}, "
-        f"PV {nanometres(answer.info.pv):.1f} nm, rms {nanometres(answer.info.rms):.1f} nm, "
-        f"21-term residual {nanometres(answer.zernike.residual_rms):.1f} nm"
+        f"PV {1e9 * answer.info.pv:.1f} nm, rms {1e9 * answer.info.rms:.1f} nm, "
+        f"21-term residual {1e9 * answer.zernike.residual_rms:.1f} nm"
     )
     return {
         "file": path.name,
-        "pv_nm": nanometres(answer.info.pv),
-        "rms_nm": nanometres(answer.info.rms),
+        "pv_nm": 1e9 * answer.info.pv,
+        "rms_nm": 1e9 * answer.info.rms,
         "valid_fraction": answer.info.valid_fraction,
     }
 
@@ -110,17 +101,17 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
         table.add_row(
             f"{row['curvature']:+.3f}",
             f"{2 * row['curvature']:+.3f}",
-            f"{nanometres(row['prediction'].predicted_rms):.1f}",
-            f"{nanometres(row['error'].rms):.1f}",
-            f"{nanometres(row['error'].max_zernike):.2f}",
+            f"{1e9 * row['prediction'].predicted_rms:.1f}",
+            f"{1e9 * row['error'].rms:.1f}",
+            f"{1e9 * row['error'].max_zernike:.2f}",
             as_wavelengths(row["error"].max_zernike),
             "yes" if row["prediction"].saturated else "no",
         )
     console.print(table)
     worst = max(row["error"].max_zernike for row in rows)
     console.print(
-        f"fitting limit of this mirror at the ends of the sweep: {nanometres(fitting_limit):.1f} nm rms; "
-        f"largest coefficient error of the sweep: {with_wavelengths(f'{nanometres(worst):.2f} nm', worst, WAVELENGTH)}"
+        f"fitting limit of this mirror at the ends of the sweep: {1e9 * fitting_limit:.1f} nm rms; "
+        f"largest coefficient error of the sweep: {with_wavelengths(f'{1e9 * worst:.2f} nm', worst, WAVELENGTH)}"
     )
 
 
@@ -129,9 +120,9 @@ def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [
         {
             "curvature": row["curvature"],
-            "predicted_rms_nm": nanometres(row["prediction"].predicted_rms),
-            "measured_rms_nm": nanometres(row["error"].rms),
-            "max_zernike_nm": nanometres(row["error"].max_zernike),
+            "predicted_rms_nm": 1e9 * row["prediction"].predicted_rms,
+            "measured_rms_nm": 1e9 * row["error"].rms,
+            "max_zernike_nm": 1e9 * row["error"].max_zernike,
             "saturated": row["prediction"].saturated,
         }
         for row in rows
@@ -235,7 +226,7 @@ def demo(
     figures |= {
         "calibration": figures_of(result) | {"seconds": wall_time, "bench_seconds": result.duration},
         "focus": rows_for_json(rows),
-        "fitting_limit_nm": nanometres(fitting_limit),
+        "fitting_limit_nm": 1e9 * fitting_limit,
         "seconds": time.monotonic() - started,
     }
     write_json(json, figures)

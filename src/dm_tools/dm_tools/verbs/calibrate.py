@@ -17,7 +17,6 @@ from dm_tools.output import (
     TakeOverOption,
     console,
     figures,
-    nanometres,
     next_step,
     output_file,
     progress_bar,
@@ -104,7 +103,7 @@ def show_result(result: Any, calibration: Any = None) -> None:
     if result.id:
         console.print(
             f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
-            f"{nanometres(result.held_out_rms):.2f} nm rms on maps held out"
+            f"{1e9 * result.held_out_rms:.2f} nm rms on maps held out"
         )
     if result.hysteresis_model:
         promised = "none while it is not in use"

@@ -5,16 +5,7 @@ from typing import Annotated
 import typer
 
 from dm_common.figures import two_fold
-from dm_tools.output import (
-    JsonOption,
-    NamespaceOption,
-    TakeOverOption,
-    console,
-    figures,
-    nanometres,
-    next_step,
-    write_json,
-)
+from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import (
     BUSY_S,
     MENTIONED,
@@ -88,10 +79,10 @@ def check(
     maps = f"{response.revision} map{'' if response.revision == 1 else 's'}"
     console.print(
         f"since the calibration was made: {maps} taken in, gains changed by up to {response.gain_drift:.2%}, the "
-        f"figure by {nanometres(response.offset_drift):.2f} nm rms"
+        f"figure by {1e9 * response.offset_drift:.2f} nm rms"
     )
     names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
-    write_json(json, {"check": figures(response, *names) | {"promised_nm": nanometres(promised)}})
+    write_json(json, {"check": figures(response, *names) | {"promised_nm": 1e9 * promised}})
     if not (response.accepted or forget):
         cure = "as the message says, or ./dm calibrate" if "./dm check --" in response.message else "./dm calibrate"
         next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}", namespace)

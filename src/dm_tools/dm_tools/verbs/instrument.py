@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, console, nanometres, next_step, output_file, write_json
+from dm_tools.output import JsonOption, console, next_step, output_file, write_json
 from dm_tools.parameter_changes import keep_before
 
 #: Columns of tables that hold no numbers.
@@ -103,7 +103,7 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     write_whole(target, fits_bytes(replace(surfaces[0], sag=found.sag), "dm instrument flats"))
     console.print(
         f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "
-        f"{nanometres(found.left):.2f} nm rms",
+        f"{1e9 * found.left:.2f} nm rms",
         soft_wrap=True,
     )
     if found.open_orders:
@@ -123,7 +123,7 @@ def _retrace(maps: list[Any]) -> dict[str, Any]:
 
     found, before, left = find_retrace(maps)
     console.print(
-        f"coefficients differ by up to {nanometres(before):.2f} nm between these maps, by {nanometres(left):.2f} nm "
+        f"coefficients differ by up to {1e9 * before:.2f} nm between these maps, by {1e9 * left:.2f} nm "
         "without the retrace error"
     )
     return {"retrace": [round(float(value), 9) for value in found]}

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 from dm_tools.running_suite import running_suite
 
 
@@ -33,11 +33,11 @@ def measure(
     radius = info.aperture_radius
     figures: dict[str, Any] = {
         "curvature": curvature_of_defocus(coefficients[DEFOCUS], radius) if radius > 0 else None,
-        "rms_beyond_tilt_nm": nanometres(rms_beyond_tilt(coefficients, answer.zernike.residual_rms)),
-        "rms_nm": nanometres(info.rms),
-        "pv_nm": nanometres(info.pv),
+        "rms_beyond_tilt_nm": 1e9 * rms_beyond_tilt(coefficients, answer.zernike.residual_rms),
+        "rms_nm": 1e9 * info.rms,
+        "pv_nm": 1e9 * info.pv,
         "valid_fraction": info.valid_fraction,
-        "zernike_nm": {name: nanometres(value) for name, value in zip(SPOKEN, coefficients, strict=True)},
+        "zernike_nm": {name: 1e9 * value for name, value in zip(SPOKEN, coefficients, strict=True)},
         "file": info.file,
     }
     terms = list(figures["zernike_nm"].items())[PISTON_TILT:]

@@ -11,7 +11,6 @@ from dm_tools.output import (
     TakeOverOption,
     console,
     figures,
-    nanometres,
     next_step,
     progress_bar,
     write_json,
@@ -56,7 +55,7 @@ def _build(client: Any, curvatures: list[float], conic: float, zernike: list[flo
 def _figures(book: Any) -> dict[str, Any]:
     recipes = [
         figures(recipe, "curvature", "conic_constant", "max_zernike_nm", "rms_nm", "maps")
-        | {"zernike_nm": [nanometres(term) for term in recipe.zernike]}
+        | {"zernike_nm": [1e9 * term for term in recipe.zernike]}
         for recipe in book.recipes
     ]
     return figures(book, "degauss_steps", "interpolation_error_nm") | {"recipes": recipes}
@@ -121,7 +120,7 @@ def recipes(
     for recipe in book.recipes:
         console.print(
             f"{shape_text(recipe)}, conic constant {recipe.conic_constant:g}: largest coefficient error "
-            f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
+            f"{1e9 * recipe.max_zernike:.2f} nm, {1e9 * recipe.rms:.1f} nm rms, {recipe.maps} maps"
         )
     if not book.calibration_id:
         console.print("no calibration is in use")

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, progress_bar, write_json
 
 
 def replay(
@@ -83,8 +83,8 @@ def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path 
         console.print(f"[yellow]remark[/] {remark}")
     fit = calibration.fit
     console.print(
-        f"{int(fit.used.sum())} of {len(calibration.maps)} maps, residual {nanometres(fit.in_sample_rms):.2f} nm "
-        f"in-sample, {nanometres(fit.held_out_rms):.2f} nm held out"
+        f"{int(fit.used.sum())} of {len(calibration.maps)} maps, residual {1e9 * fit.in_sample_rms:.2f} nm "
+        f"in-sample, {1e9 * fit.held_out_rms:.2f} nm held out"
     )
     published = session.published
     differing = differences(calibration, published) if published is not None else None
@@ -100,8 +100,8 @@ def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path 
         console.print(f"stored: {file}")
     return {
         "maps": len(calibration.maps),
-        "in_sample_rms_nm": nanometres(fit.in_sample_rms),
-        "held_out_rms_nm": nanometres(fit.held_out_rms),
+        "in_sample_rms_nm": 1e9 * fit.in_sample_rms,
+        "held_out_rms_nm": 1e9 * fit.held_out_rms,
         "compared_with": published.id if published is not None else None,
         "identical": None if differing is None else not differing,
         "file": file,

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 
 #: Stores of the node `calibration`: that of the shipped virtual bench, and the default.
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
@@ -121,7 +121,7 @@ def report(
     keep_people(names)
     page, pdf = write_report(found, folder, file, values)
     console.print(
-        f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
+        f"calibration [bold]{found.id}[/]: residual {1e9 * found.fit.held_out_rms:.2f} nm rms on maps held out, "
         f"{len(found.limitations)} known limitations"
     )
     console.print(f"page: {os.path.relpath(page)}\nPDF: {os.path.relpath(pdf)}")

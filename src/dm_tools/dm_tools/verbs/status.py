@@ -7,7 +7,7 @@ from typing import Any
 from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
 from dm_common.optics.conic import range_text
-from dm_tools.output import JsonOption, NamespaceOption, console, in_namespace, nanometres, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, in_namespace, write_json
 from dm_tools.running_suite import (
     NEEDED,
     REPORT_S,
@@ -61,11 +61,9 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "mirror": mirror.serial if mirror is not None else None,
         "held_by": by or None,
         "curvature": shape.curvature if shape else None,
-        "bound_nm": nanometres(shape.bound) if shape else None,
+        "bound_nm": 1e9 * shape.bound if shape else None,
         "calibration": calibration.id if calibration is not None else None,
-        "error_bound_nm": nanometres(capabilities.error_bound)
-        if capabilities and not capabilities.error_code
-        else None,
+        "error_bound_nm": 1e9 * capabilities.error_bound if capabilities and not capabilities.error_code else None,
     }
     write_json(json, {"status": figures})
 

@@ -15,7 +15,7 @@ from dm_tools.console.charts.plots import residual_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
-from dm_tools.console.view_models import NM, NUMBER_MAX, calibration_text, evenly
+from dm_tools.console.view_models import NUMBER_MAX, calibration_text, evenly
 from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card, folded
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
@@ -83,7 +83,7 @@ class CalibrationCard:
         progress = session.shown_progress
         step = f"Step {progress.step} of {progress.steps}: {progress.text}" if progress.steps else "The run begins."
         self._progress.show(step if running else "")
-        residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
+        residuals_nm = [1e9 * residual for residual in list(session.ros.watched["calibrate"].residuals)]
         self._residuals.show(residual_chart(residuals_nm) if residuals_nm else None)
         limitations = snapshot.calibration.known_limitations if snapshot.calibration is not None else []
         lines = _rows(calibration_text(snapshot.calibration))
