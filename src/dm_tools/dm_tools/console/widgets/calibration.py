@@ -16,7 +16,7 @@ from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import NUMBER_MAX, calibration_text, evenly
-from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card, folded
+from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
@@ -121,7 +121,7 @@ class RecipesCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        with folded("Recipes"):
+        with card("Recipes", folded=True):
             self._text = Line("text")
             self._table = ui.html("", sanitize=False).classes("scroll")
             self._table.props('tabindex="0" role="region" aria-label="Recipes of the calibration in use"')

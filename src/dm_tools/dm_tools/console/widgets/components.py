@@ -17,18 +17,10 @@ def heading(text: str, level: int = 2) -> None:
 
 
 @contextlib.contextmanager
-def card(title: str) -> Iterator[None]:
-    """A card with a heading."""
-    with ui.element("section").classes("card").props(f'aria-label="{title}"'):
-        heading(title)
-        yield
-
-
-@contextlib.contextmanager
-def folded(title: str) -> Iterator[None]:
-    """A card of details that a click on its heading unfolds."""
-    with ui.element("details").classes("card").props(f'aria-label="{title}"'):
-        with ui.element("summary"):
+def card(title: str, folded: bool = False) -> Iterator[None]:
+    """A card with a heading; a `folded` one is unfolded by a click on it."""
+    with ui.element("details" if folded else "section").classes("card").props(f'aria-label="{title}"'):
+        with ui.element("summary") if folded else contextlib.nullcontext():
             heading(title)
         yield
 

@@ -8,7 +8,7 @@ from nicegui import ui
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import badges, diagnostic_rows, log_rows, missing, now_text, shortened
-from dm_tools.console.widgets.components import ActionButton, Line, folded, heading
+from dm_tools.console.widgets.components import ActionButton, Line, card, heading
 
 
 class Header:
@@ -83,18 +83,11 @@ def _empty(text: str) -> str:
     return f'<div class="empty">{escape(text)}</div>'
 
 
-def _table(rows: list[tuple[str, str, str, str]]) -> str:
-    if not rows:
-        return _empty("Nothing was logged yet.")
-    cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
-    return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
-
-
 class DiagnosticsCard:
     """The health that the nodes report, the worst first."""
 
     def __init__(self) -> None:
-        with folded("Diagnostics"):
+        with card("Diagnostics", folded=True):
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="region" aria-label="Diagnostics"')
 
@@ -112,10 +105,13 @@ class LogCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        with folded("Log"):
+        with card("Log", folded=True):
             self._all = ui.switch("Show everything, not only warnings and errors", value=True)
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="log" aria-label="Log"')
 
     def refresh(self, _snapshot: Snapshot) -> None:
-        self._place.set_content(_table(log_rows(list(self._session.ros.log), bool(self._all.value))))
+        rows = log_rows(list(self._session.ros.log), bool(self._all.value))
+        cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
+        table = "".join(f"<tr>{row}</tr>" for row in cells)
+        self._place.set_content(f"<table>{table}</table>" if rows else _empty("Nothing was logged yet."))
