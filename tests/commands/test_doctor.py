@@ -295,12 +295,12 @@ def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
     refused, alone = Finding("no EDAC40 answers", "check power"), Finding("none in the ROS domain 0", "", note=True)
     running = Finding("virtual_bench, pdm_driver, in the ROS domain 0", "")
-    held = held_by_the_nodes("electronics at 127.0.0.1:1", refused, running._asdict())
+    held = held_by_the_nodes("electronics at 127.0.0.1:1", refused, running)
     assert held is not None and held.note and held.problem == refused.problem and "./dm status" in held.cure
     without = Finding("running: calibration; not running: pdm_driver (nothing can move the mirror)", "start it", True)
     told = (("electronics at 127.0.0.1:1", alone), ("electronics at 1", without), ("watched folder /maps", running))
     for check, others in told:
-        assert held_by_the_nodes(check, refused, others._asdict()) == refused
+        assert held_by_the_nodes(check, refused, others) == refused
 
 
 def test_a_driver_that_does_not_reach_its_unit_hides_nothing_of_what_is_wrong_with_it() -> None:
@@ -310,7 +310,7 @@ def test_a_driver_that_does_not_reach_its_unit_hides_nothing_of_what_is_wrong_wi
         client = SimpleNamespace(wait=lambda condition, _timeout_s: condition(), messages=messages)
         assert doctor_machine.link_lost(client) == reason
     refused = Finding("cannot open EDAC40: Connection refused", "check power")
-    running = Finding(f"pdm_driver, in the ROS domain 0{doctor_machine.LINK_LOST}no route", "switch it on")._asdict()
+    running = Finding(f"pdm_driver, in the ROS domain 0{doctor_machine.LINK_LOST}no route", "switch it on")
     for check in ("electronics at 127.0.0.1:1", "serial port /dev/ttyUSB0"):
         assert held_by_the_nodes(check, refused, running) == refused
     ports = held_by_the_nodes("ports of the virtual bench", refused, running)

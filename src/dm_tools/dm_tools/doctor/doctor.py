@@ -1,7 +1,7 @@
 """`dm doctor`: what is wrong on this machine or bench, in words, and how to cure it."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -26,10 +26,9 @@ def doctor(
     checks = machine_checks(namespace)
     if config is not None:
         checks += bench_checks(config, namespace)
-    findings: dict[str, dict[str, Any] | None] = {}
+    findings: dict[str, Finding | None] = {}
     for name, run in checks:
-        finding = held_by_the_nodes(name, run(), findings.get("nodes that are running"))
-        findings[name] = None if finding is None else finding._asdict()
+        findings[name] = finding = held_by_the_nodes(name, run(), findings.get("nodes that are running"))
         if finding is None or not finding.cure:
             console.print("[green]ok[/]   ", end=" ")
             console.print(f"{name}: {finding.problem}" if finding else name, soft_wrap=True, markup=False)
@@ -37,18 +36,18 @@ def doctor(
             mark = "[yellow]note[/] " if finding.note else "[red]WRONG[/]"
             console.print(mark, end=" ")
             console.print(f"{name}: {finding.problem}\n      cure: {finding.cure}", soft_wrap=True, markup=False)
-    write_json(json, {"doctor": findings})
-    if wrong := sum(bool(finding and finding["cure"] and not finding["note"]) for finding in findings.values()):
+    write_json(json, {"doctor": {name: found and found._asdict() for name, found in findings.items()}})
+    if wrong := sum(bool(finding and finding.cure and not finding.note) for finding in findings.values()):
         next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again", namespace)
         raise typer.Exit(1)
     running = findings["nodes that are running"]
     start = f"./dm up{f' --config {config}' if config else ''}"
-    next_step("./dm status" if running and not running["cure"] else start, namespace)
+    next_step("./dm status" if running and not running.cure else start, namespace)
 
 
-def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:
+def held_by_the_nodes(check: str, finding: Finding | None, running: Finding | None) -> Finding | None:
     """The finding of a check; only a note if running nodes of the bench hold what was checked."""
-    said = (running or {}).get("problem", "")
+    said = running.problem if running is not None else ""
     held = PORTS if LINK_LOST in said else (*PORTS, *UNIT)
     if finding is None or not check.startswith(held) or "pdm_driver" not in said.partition("; not running")[0]:
         return finding

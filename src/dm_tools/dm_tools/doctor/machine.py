@@ -160,22 +160,16 @@ def running_nodes(namespace: str = "") -> Finding:
         if count and (skew := _skew(client)) is not None:
             return skew
         reason = link_lost(client) if "pdm_driver" in count else ""
-    lacking = ", ".join(f"{name} ({effect})" for name, effect in NEEDED.items() if count and name not in count)
+    if not count:
+        return Finding(f"none {place}", "./dm up starts them", note=True)
+    running = f"{', '.join(count)}, {place}"
+    lacking = ", ".join(f"{name} ({effect})" for name, effect in NEEDED.items() if name not in count)
     lacking = f"; not running: {lacking}" if lacking else ""
     if reason:
-        return Finding(
-            f"{', '.join(count)}, {place}{LINK_LOST}{reason}{lacking}",
-            "switch the unit on and check its cable; ./dm doctor --config FILE looks for it",
-        )
-    if lacking:
-        return Finding(
-            f"{', '.join(count)}, {place}{lacking}",
-            "end ./dm up with Ctrl-C and start it again",
-            note=True,
-        )
-    if count:
-        return Finding(f"{', '.join(count)}, {place}", "")
-    return Finding(f"none {place}", "./dm up starts them", note=True)
+        cure = "switch the unit on and check its cable; ./dm doctor --config FILE looks for it"
+        return Finding(f"{running}{LINK_LOST}{reason}{lacking}", cure)
+    cure = "end ./dm up with Ctrl-C and start it again" if lacking else ""
+    return Finding(f"{running}{lacking}", cure, note=bool(lacking))
 
 
 def _skew(client: Any) -> Finding | None:

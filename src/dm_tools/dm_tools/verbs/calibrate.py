@@ -246,11 +246,10 @@ def calibrate(
         note=note,
         take_over=take_over,
     )
-    fresh = fresh and not dry_run
+    if dry_run:
+        fresh, write = False, None
     with running_suite(namespace) as client, naming_holder(client):
-        source = None
-        if write is not None and not dry_run:
-            source = source_of(write, config, client.mirror_info.serial, namespace)
+        source = source_of(write, config, client.mirror_info.serial, namespace) if write is not None else None
         if fresh:
             set_parameter(client, "calibration", "start_fresh", True)
         try:

@@ -28,11 +28,9 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
     from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
-        if not client.wait(lambda: nodes_of_suite(client), FIND_S):
-            return None, JUDGED_BY, ""
-        client.wait(lambda: "calibration" in client.messages, BUSY_S)
-        message = client.messages.get("calibration")
-        if message is None:
+        if client.wait(lambda: nodes_of_suite(client), FIND_S):
+            client.wait(lambda: "calibration" in client.messages, BUSY_S)
+        if (message := client.messages.get("calibration")) is None:
             return None, JUDGED_BY, ""
         values = JUDGED_BY
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)
