@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle, RegularPolygon
 
 from dm_common.optics.piston_tilt import remove_plane
@@ -25,7 +23,7 @@ def draw_command(axes: Axes, signals: np.ndarray, positions: np.ndarray, apertur
     """Actuator signals (N,) as hexagons at `positions` (N, 2) [m], with the working aperture."""
     distances = np.linalg.norm(positions[1:] - positions[0], axis=1)
     side = distances.min() * 1e3 / np.sqrt(3.0)
-    scale, colours = Normalize(-1, 1), plt.get_cmap("cividis")
+    scale, colours = Normalize(-1, 1), colormaps["cividis"]
     for number, ((x, y), signal) in enumerate(zip(positions * 1e3, signals, strict=True), start=1):
         axes.add_patch(RegularPolygon((x, y), 6, radius=side, facecolor=colours(scale(signal)), edgecolor="white"))
         brightness = "black" if signal > 0.1 else "white"
@@ -33,7 +31,7 @@ def draw_command(axes: Axes, signals: np.ndarray, positions: np.ndarray, apertur
     axes.add_patch(Circle((0, 0), aperture_radius * 1e3, fill=False, edgecolor="tab:red", linewidth=0.8))
     reach = np.abs(positions).max() * 1e3 + side
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    return plt.cm.ScalarMappable(scale, colours)
+    return ScalarMappable(scale, colours)
 
 
 def draw_map(axes: Axes, values: np.ndarray, info: Any, limit: float, colours: str) -> Any:
@@ -60,7 +58,7 @@ def save_sweep_figure(
     positions = np.column_stack([mirror.actuator_x, mirror.actuator_y])
     curvatures = np.array([row["curvature"] for row in rows])
     shown = [rows[round(share * (len(rows) - 1))] for share in COLUMNS]
-    figure = plt.figure(figsize=(13, 11), layout="constrained")
+    figure = Figure(figsize=(13, 11), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(4, len(shown), height_ratios=(1, 1, 1, 0.9))
     measured_sag = [remove_plane(row["sag"].astype(float)) for row in shown]
@@ -107,5 +105,4 @@ def save_sweep_figure(
     summary.margins(y=0.12)
     summary.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return path

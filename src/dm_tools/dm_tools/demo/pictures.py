@@ -4,13 +4,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -52,7 +49,7 @@ def _sharpness_axes(axes: Axes, found: Sequence[Focused]) -> None:
 
 def save_contact_sheet(found: Sequence[Focused], path: Path, title: str) -> Path:
     """The image at the end of each search, and the sharpness of all that led there, as a PNG file."""
-    figure = plt.figure(figsize=(4.2 * len(found), 7.2), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(found), 7.2), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(2, len(found))
     for number, (item, colour) in enumerate(zip(found, COLOURS, strict=False)):
@@ -67,7 +64,6 @@ def save_contact_sheet(found: Sequence[Focused], path: Path, title: str) -> Path
         axes.axvline(item.result.curvature, color=colour, linewidth=0.8)
     axes.legend(title="object")
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return path
 
 
@@ -75,7 +71,7 @@ def save_animation(
     found: Sequence[Focused], sweep: Sweep, approach: Approach, path: Path, title: str, frames_per_second: int = 7
 ) -> Path:
     """What the camera does, as a GIF: searches, a sweep in which the picture stands still, its depth, and tracking."""
-    figure: Figure = plt.figure(figsize=(8.4, 3.8), dpi=80, layout="constrained")
+    figure = Figure(figsize=(8.4, 3.8), dpi=80, layout="constrained")
     figure.suptitle(title, fontsize=8, color="gray")
     left, right = figure.subplots(1, 2)
     picture, frame = _draw_image(left, found[0].shots[0].image, found[0].region, COLOURS[0])
@@ -85,7 +81,7 @@ def save_animation(
     # A cross on the middle of the picture shows that it stands still.
     height, width = sweep.sharp.shape
     cross = left.axhline(height / 2), left.axvline(width / 2)
-    plt.setp(cross, color="#F0E442", linewidth=0.8, visible=False)
+    setp(cross, color="#F0E442", linewidth=0.8, visible=False)
     depth = right.inset_axes((0, 0, 1, 1))
     depth.set(visible=False, xticks=[], yticks=[])
     depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest", aspect="auto")
@@ -115,11 +111,11 @@ def save_animation(
         show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
 
     def stand(shown: int) -> None:
-        plt.setp(cross, visible=True)
+        setp(cross, visible=True)
         show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
 
     def everything(_shown: int) -> None:
-        plt.setp(cross, visible=False)
+        setp(cross, visible=False)
         picture.set_data(sweep.sharp)
         depth.set(visible=True)
         right.set_axis_off()
@@ -142,7 +138,7 @@ def save_animation(
     schedule += [(track, (shown,), 1) for shown in range(len(approach.shots))]
     schedule += [(track, (len(approach.shots) - 1,), HOLD)] if approach.shots else []
 
-    canvas: Any = figure.canvas
+    canvas = FigureCanvasAgg(figure)
     images = []
     for draw, arguments, _ in schedule:
         draw(*arguments)
@@ -158,5 +154,4 @@ def save_animation(
     palette.putpalette([*(palette.getpalette() or ())[: 3 * PALETTE], *greys.tolist()])
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
-    plt.close(figure)
     return path
