@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from dm_bringup import suite
+from dm_tools.demo import demo_bench
 from fault_injection.rigs.forked_node import ForkedSuite
 from studies.documentation.answer_cases import CASES
 from studies.documentation.answers import PAGE, committed, parsed, run, section
@@ -17,7 +17,7 @@ from studies.documentation.special_cases import BENCH, HELD
 
 @pytest.mark.processes
 def test_the_table_of_answers_is_what_a_run_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suite, "Suite", ForkedSuite)
+    monkeypatch.setattr(demo_bench, "Suite", ForkedSuite)
     wanted = committed(PAGE.read_text())
     assert wanted and wanted.strip() == section(run()).strip(), "./dm exec python -m studies.documentation.answers"
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import typer
 
+from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode
 from dm_tools.output import NotRunningError, console, next_step, write_json
 from dm_tools.parameter_changes import get_parameter, set_parameter, source_of, write_parameters
@@ -17,8 +18,6 @@ STILL_PX = 0.5
 
 def region_of(text: str) -> tuple[float, ...]:
     """Parse `text` as left, top, width and height. Raises typer.BadParameter."""
-    from dm_autofocus.sharpness import check_region
-
     try:
         return check_region([float(part) for part in text.split(",")])
     except ValueError as error:

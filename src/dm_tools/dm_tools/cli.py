@@ -14,6 +14,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from dm_bringup.nodes import node_environment
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import with_point
 from dm_tools.output import NotRunningError, fail
@@ -162,8 +163,6 @@ app = make_app()
 def _set_environment() -> None:
     """Set the environment that every process of the suite runs with, except what `./dm` or the user has set."""
     from ament_index_python.packages import get_package_share_directory
-
-    from dm_bringup.nodes import node_environment
 
     with suppress(LookupError, OSError):  # no ROS workspace is sourced: only the help works
         for name, value in node_environment(Path(get_package_share_directory("dm_bringup")) / "config").items():

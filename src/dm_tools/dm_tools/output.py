@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
+from dm_common.atomic_write import write_whole
 from dm_common.figures import in_wavelengths
 
 #: Square brackets that are no markup of these commands, and the backslashes before them.
@@ -148,8 +149,6 @@ def _plain(value: Any) -> Any:
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     """Write figures whole or not at all, `-` to standard output; None writes nothing."""
-    from dm_common.atomic_write import write_whole
-
     if path is None:
         return
     text = json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n"

@@ -5,8 +5,13 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
+from dm_bringup.config_edit import edited, values_of
+from dm_bringup.sections import ConfigError
+from dm_bringup.suite import load_config
+from dm_common.atomic_write import write_whole
 from dm_common.errors import ErrorCode
 from dm_tools.output import console
+from dm_tools.verbs.up import CAMERA, shared_config
 
 
 def set_parameter(client: Any, node: str, name: str, value: Any) -> None:
@@ -55,10 +60,6 @@ def source_of(target: Path, config: Path | None, serial: str, namespace: str = "
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
     """
-    from dm_bringup.sections import ConfigError
-    from dm_bringup.suite import load_config
-    from dm_tools.verbs.up import shared_config
-
     source = config or (target if target.exists() else shared_config("bench.yaml"))
     written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
@@ -81,10 +82,6 @@ def write_parameters(
         ConfigError: `source` cannot be changed without losing its form.
         OSError: `source` cannot be read, or `target` cannot be written; an existing `target` is then unchanged.
     """
-    from dm_bringup.config_edit import edited, values_of
-    from dm_common.atomic_write import write_whole
-    from dm_tools.verbs.up import CAMERA, shared_config
-
     if not parameters:
         console.print(f"no parameter to change: {target} is not written, {source} holds")
         return
@@ -97,8 +94,6 @@ def write_parameters(
 
 def keep_before(target: Path) -> None:
     """Copy an existing file at `target` beside it under a free name. Raises OSError."""
-    from dm_common.atomic_write import write_whole
-
     if target.exists():
         kept = (target.with_name(f"{target.name}.before{number}") for number in chain([""], count(2)))
         before = next(path for path in kept if not path.exists())

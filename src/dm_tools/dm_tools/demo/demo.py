@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
+from dm_bringup.suite import Suite
 from dm_common.figures import with_wavelengths
 from dm_tools.demo.demo_bench import (
     Hysteresis,
@@ -19,6 +21,7 @@ from dm_tools.demo.demo_bench import (
     wait_for_calibration,
 )
 from dm_tools.output import WAVELENGTH, JsonOption, as_wavelengths, console, next_step, progress_bar, write_json
+from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
 #: Default number of maps for the identification of hysteresis and creep.
 MAPS = 200
@@ -28,7 +31,6 @@ CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     """Read a real map through an interferometer node of its own; returns the figures for JSON."""
-    from dm_bringup.suite import Suite
     from dm_client import STARTING_S, DeformableMirrorClient
 
     nodes = ("interferometer",)
@@ -91,8 +93,6 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
 
 def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> None:
     """Print the table: predicted and re-measured errors, and the fitting limit."""
-    from rich.table import Table
-
     table = Table(title=f"open-loop focus, {how}: predicted before the move, re-measured after it")
     errors = ("predicted rms nm", "measured rms nm", "largest coeff. nm", "λ/n")
     for heading in ("curvature 1/m", "dioptre", *errors, "saturated"):
@@ -176,7 +176,6 @@ def demo(
     from dm_client import DeformableMirrorClient
     from dm_common.ros.domains import own_domain
     from dm_tools.demo.figures import save_sweep_figure
-    from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
     started = time.monotonic()
     folder = usable_folder(out)

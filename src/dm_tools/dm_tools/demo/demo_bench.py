@@ -12,6 +12,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from dm_bringup.suite import Suite, load_config
+from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
+from dm_tools.verbs.up import move_trigger, shared_config
+
 #: Value of a port that the virtual bench does not open.
 OFF = -1
 #: Name of the file that marks the folder of a demo.
@@ -69,9 +73,6 @@ def bench_config(
         ConfigError: the file cannot be used.
         ValueError: it lacks the virtual bench, a node, or another part that a run changes.
     """
-    from dm_bringup.suite import load_config
-    from dm_tools.verbs.up import move_trigger, shared_config
-
     source = source if source is not None else shared_config("bench.yaml")
     config = load_config(source)
     for node in ("virtual_bench", "pdm_driver", "interferometer", "calibration", "focus_controller"):
@@ -131,7 +132,6 @@ def make_empty(folder: Path) -> None:
 @contextlib.contextmanager
 def running_bench(config: dict[str, dict[str, Any]], logs: Path, domain: int, client_class: Any) -> Iterator[Any]:
     """The nodes of a configuration and a client of theirs, once the driver accepts commands."""
-    from dm_bringup.suite import Suite
     from dm_client import STARTING_S
 
     with Suite(config, logs, domain) as suite, client_class(domain=domain, timeout_s=STARTING_S) as client:
@@ -152,8 +152,6 @@ def wait_for_calibration(client: Any, identifier: str) -> None:
 def identify_hysteresis(client: Any, maps: int, note: str) -> Any:
     """Calibrate with hysteresis and creep from `maps` maps and print the outcome; returns the action's result."""
     from dm_msgs.action import Calibrate
-
-    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
 
     goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note=note)
     result = run_calibration(client, goal)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dm_bringup.nodes import NODES
+from dm_tools.running_suite import BUSY_S, NEEDED, nodes_of_suite, where
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
 #: Virtual bench, autofocus and every program take a segment of 16 MB in /dev/shm, see config/fastdds.xml.
@@ -144,7 +145,6 @@ def messages() -> Finding | None:
 def running_nodes(namespace: str = "") -> Finding:
     """Running nodes of the suite: twice is wrong, none is a note, and a clock that differs from ours is wrong."""
     from dm_client import DeformableMirrorClient
-    from dm_tools.running_suite import BUSY_S, NEEDED, nodes_of_suite, where
 
     with DeformableMirrorClient(namespace) as client:
         client.wait(lambda: max(nodes_of_suite(client).values(), default=0) > 1, DISCOVERY_S)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import in_nanometres, two_fold, with_point
+from dm_tools.boresight import run_boresight
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -214,7 +215,6 @@ def calibrate(
     from dm_msgs.action import Calibrate
 
     from dm_client import DeformableMirrorError
-    from dm_tools.boresight import run_boresight
 
     if config is not None and write is None:
         raise typer.BadParameter("--config without --write: only that needs to know the file of the nodes")

@@ -10,6 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.atomic_write import write_whole
+from dm_common.errors import CodedError
+from dm_common.optics.zernike import MAX_ORDER
 from dm_tools.output import JsonOption, console, next_step, output_file, write_json
 from dm_tools.parameter_changes import keep_before
 
@@ -46,7 +49,6 @@ def instrument(
     from dm_calibration.map_files import read_map
     from dm_calibration.optics.aperture import MapRejectedError
     from dm_calibration.optics.phase_steps import mend_phase_steps
-    from dm_common.errors import CodedError
 
     def read(path: Path) -> Any:
         surface = read_map(path, xyz_unit=xyz_unit or None)
@@ -82,8 +84,6 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     from dm_calibration.map_files.fits import fits_bytes
     from dm_calibration.optics.flats import FlatTest, reference_from_flats
     from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
-    from dm_common.atomic_write import write_whole
-    from dm_common.optics.zernike import MAX_ORDER
 
     rows = _table(table, "file", "reference", "part", "degrees")
     sources = [table.parent / row[0] for row in rows]

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.optics.conic import pitch_of_sphere
+from dm_common.optics.zernike import DEFOCUS, PISTON_TILT, SPOKEN, curvature_of_defocus, rms_beyond_tilt
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 from dm_tools.running_suite import running_suite
 
@@ -23,8 +25,6 @@ def measure(
     json: JsonOption = None,
 ) -> None:
     """Take one map of the mirror as it stands, and say what it shows. Nothing moves."""
-    from dm_common.optics.zernike import DEFOCUS, PISTON_TILT, SPOKEN, curvature_of_defocus, rms_beyond_tilt
-
     if reference_sphere is not None and not 0.0 < abs(reference_sphere) < math.inf:
         raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
@@ -63,7 +63,6 @@ def measure(
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:
     """Print the lateral resolution (m per pixel) that a map of a known sphere gives, as parameters, and its limits."""
     from dm_calibration.influence.poke_cure import parameter_text
-    from dm_common.optics.conic import pitch_of_sphere
 
     try:
         pitch, share = pitch_of_sphere(coefficients, info.aperture_radius_px, info.pitch, radius_of_curvature)

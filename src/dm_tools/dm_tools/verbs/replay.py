@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_bringup.suite import load_config
 from dm_tools.output import JsonOption, NamespaceOption, console, progress_bar, write_json
 
 
@@ -69,7 +70,6 @@ def replay(
 
 def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
     """Make the calibration again; returns its figures."""
-    from dm_bringup.suite import load_config
     from dm_calibration.store.calibration_store import CalibrationStore
     from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
 

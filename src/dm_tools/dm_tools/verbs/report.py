@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
+from dm_tools.parameter_changes import get_parameter
+from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
 #: Stores of the node `calibration`: that of the shipped virtual bench, and the default.
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
@@ -24,8 +26,6 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
     """
     from dm_calibration.calibration_parameters import JUDGED_BY
     from dm_client import DeformableMirrorClient, DeformableMirrorError
-    from dm_tools.parameter_changes import get_parameter
-    from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
         if client.wait(lambda: nodes_of_suite(client), FIND_S):

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_bringup.suite import Config, load_config
+from dm_bringup.suite import Config, Suite, load_config
 from dm_tools.output import checked_namespace, console, next_step
 from dm_tools.running_suite import calibration_refused, unknown_history
 
@@ -83,7 +83,6 @@ def up(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores it
             signal.signal(number, lambda _number, _frame: stop.set())
-    from dm_bringup.suite import Suite
     from dm_tools.doctor.bench import effective, sound_values, taken_ports
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
