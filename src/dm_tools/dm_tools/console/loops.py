@@ -61,9 +61,8 @@ def way(start: float, amplitude: float, low: float, high: float) -> list[float]:
 def modelled_way(law: HysteresisModel, state: HysteresisState, actuator: int, signals: Sequence[float]) -> list[float]:
     """Effective signals of one actuator (1-based) that goes from `state` through `signals`, without further creep."""
     values = []
-    shape = state.signals.copy()
     for signal in signals:
-        shape = shape.copy()
+        shape = state.signals.copy()
         shape[actuator - 1] = signal
         state = law.move(state, shape, state.time)
         values.append(float(law.effective(state)[actuator - 1]))

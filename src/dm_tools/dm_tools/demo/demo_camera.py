@@ -22,7 +22,7 @@ from dm_tools.demo.demo_bench import (
     wait_for_calibration,
 )
 from dm_tools.demo.pictures import save_animation, save_contact_sheet
-from dm_tools.output import console, next_step, write_json
+from dm_tools.output import console, figures, next_step, write_json
 from dm_tools.verbs import calibrate
 from dm_tools.verbs.up import DISTANCES, RATE, add_camera
 
@@ -45,16 +45,13 @@ def regions(count: int) -> list[Region]:
 
 def figures_of(item: Focused) -> dict[str, Any]:
     """One object for JSON."""
-    return {
+    return figures(item.result, "curvature", "images", "images_dropped") | {
         "distance_m": item.distance,
         "found_m": item.result.distance,
         "dioptre_error": item.result.dioptre - 1 / item.distance,
-        "curvature": item.result.curvature,
         "sharpness": item.final.sharpness,
         "sharpness_dullest": min(shot.sharpness for shot in item.shots),
         "sharpness_by_distance_only": item.by_distance,
-        "images": item.result.images,
-        "images_dropped": item.result.images_dropped,
         "seconds": item.result.duration,
     }
 
@@ -65,13 +62,13 @@ def show(found: list[Focused], depth: float) -> None:
     for heading in ("object m", "found m", "error dioptre", "sharpness", "by distance only", "images", "seconds"):
         table.add_column(heading, justify="right")
     for item in found:
-        figures = figures_of(item)
+        row = figures_of(item)
         table.add_row(
             f"{item.distance:g}",
             f"{item.result.distance:.2f}",
-            f"{figures['dioptre_error']:+.4f}",
-            f"{figures['sharpness']:.3f}",
-            f"{figures['sharpness_by_distance_only']:.3f}",
+            f"{row['dioptre_error']:+.4f}",
+            f"{row['sharpness']:.3f}",
+            f"{row['sharpness_by_distance_only']:.3f}",
             str(item.result.images),
             f"{item.result.duration:.1f}",
         )

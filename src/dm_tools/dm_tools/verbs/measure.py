@@ -7,7 +7,7 @@ import typer
 
 from dm_common.optics.conic import pitch_of_sphere
 from dm_common.optics.zernike import DEFOCUS, PISTON_TILT, SPOKEN, curvature_of_defocus, rms_beyond_tilt
-from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, figures, next_step, write_json
 from dm_tools.running_suite import running_suite
 
 
@@ -31,32 +31,28 @@ def measure(
         answer = client.measure(label, answer_only=reference_sphere is not None)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
     radius = info.aperture_radius
-    figures: dict[str, Any] = {
+    found: dict[str, Any] = {
         "curvature": curvature_of_defocus(coefficients[DEFOCUS], radius) if radius > 0 else None,
         "rms_beyond_tilt_nm": 1e9 * rms_beyond_tilt(coefficients, answer.zernike.residual_rms),
-        "rms_nm": 1e9 * info.rms,
-        "pv_nm": 1e9 * info.pv,
-        "valid_fraction": info.valid_fraction,
         "zernike_nm": {name: 1e9 * value for name, value in zip(SPOKEN, coefficients, strict=True)},
-        "file": info.file,
-    }
-    terms = list(figures["zernike_nm"].items())[PISTON_TILT:]
+    } | figures(info, "rms_nm", "pv_nm", "valid_fraction", "file")
+    terms = list(found["zernike_nm"].items())[PISTON_TILT:]
     largest = sorted(terms, key=lambda term: -abs(term[1]))[:3]
     console.print(
-        f"{figures['rms_beyond_tilt_nm']:.1f} nm rms beyond tilt, of the whole map {figures['rms_nm']:.1f} nm rms and "
-        f"{figures['pv_nm']:.1f} nm peak to valley; {info.valid_fraction:.0%} of the aperture valid"
+        f"{found['rms_beyond_tilt_nm']:.1f} nm rms beyond tilt, of the whole map {found['rms_nm']:.1f} nm rms and "
+        f"{found['pv_nm']:.1f} nm peak to valley; {info.valid_fraction:.0%} of the aperture valid"
     )
     console.print(
         f"largest coefficients beyond tilt: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
     )
-    if figures["curvature"] is not None:
-        console.print(f"defocus: as of a surface of {round(figures['curvature'], 4) + 0.0:+.4f} 1/m")
+    if found["curvature"] is not None:
+        console.print(f"defocus: as of a surface of {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}", soft_wrap=True)
     then = "./dm check compares a map with the calibration in use"
     if reference_sphere is not None:
-        figures["pitch"] = _scale(info, coefficients, reference_sphere)
+        found["pitch"] = _scale(info, coefficients, reference_sphere)
         then = "put the parameters into the parameter file; then take the sphere out"
-    write_json(json, {"measure": figures})
+    write_json(json, {"measure": found})
     next_step(then, namespace)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_bringup.suite import load_config
-from dm_tools.output import JsonOption, NamespaceOption, console, progress_bar, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, figures, progress_bar, write_json
 
 
 def replay(
@@ -43,9 +43,9 @@ def replay(
     if recalibrate:
         if rate != 1.0 or topics or commands:
             raise typer.BadParameter("--rate, --topics and --commands are for publishing, not for --recalibrate")
-        figures = _again(bag, run, namespace, store, config)
-        write_json(json, figures)
-        if figures["identical"] is False:
+        again = _again(bag, run, namespace, store, config)
+        write_json(json, again)
+        if again["identical"] is False:
             raise RuntimeError("the calibration made again is not the one that was recorded")
         return
     if run or store or config:
@@ -64,8 +64,8 @@ def replay(
         )
     count, left_out = sum(counts.values()), sorted(set(names) - counts.keys())
     console.print(f"{count} messages published")
-    figures = {"recording": str(bag.path), "messages": count, "topics": sorted(counts), "left_out": left_out}
-    write_json(json, figures)
+    published = {"recording": str(bag.path), "messages": count, "topics": sorted(counts), "left_out": left_out}
+    write_json(json, published)
 
 
 def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
@@ -100,8 +100,7 @@ def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path 
         console.print(f"stored: {file}")
     return {
         "maps": len(calibration.maps),
-        "in_sample_rms_nm": 1e9 * fit.in_sample_rms,
-        "held_out_rms_nm": 1e9 * fit.held_out_rms,
+        **figures(fit, "in_sample_rms_nm", "held_out_rms_nm"),
         "compared_with": published.id if published is not None else None,
         "identical": None if differing is None else not differing,
         "file": file,
