@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.srv import CancelGoal
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from rclpy.task import Future
@@ -19,8 +21,7 @@ from dm_common.ros import qos
 
 #: Actions that occupy mirror or interferometer for long. `move_focus` is not among them: the next move replaces it.
 LONG = ("build_recipes", "calibrate", "converge")
-#: action_msgs/GoalStatus: accepted, executing, canceling.
-RUNNING = (1, 2, 3)
+RUNNING = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 
 
 def warning_in(result: Any) -> str:
@@ -47,12 +48,10 @@ class ExternalGoals:
         self.goals = 0
         self.feedback: Any = None
         self.residuals: list[float] = []
-        interface, latched = action_type.Impl, qos_profile_action_status_default
-        node.create_subscription(interface.GoalStatusMessage, self._status_topic, self._on_status, latched)
-        feedback = f"{name}/_action/feedback"
-        node.create_subscription(interface.FeedbackMessage, feedback, self._on_feedback, qos.STATE)
-        self._interface = interface.CancelGoalService
-        self._cancel = node.create_client(self._interface, f"{name}/_action/cancel_goal")
+        latched, feedback = qos_profile_action_status_default, f"{name}/_action/feedback"
+        node.create_subscription(GoalStatusArray, self._status_topic, self._on_status, latched)
+        node.create_subscription(action_type.Impl.FeedbackMessage, feedback, self._on_feedback, qos.STATE)
+        self._cancel = node.create_client(CancelGoal, f"{name}/_action/cancel_goal")
 
     def own(self, identity: Any) -> None:
         """Note that this console is about to send the goal `identity`, a unique_identifier_msgs/UUID."""
@@ -78,7 +77,7 @@ class ExternalGoals:
 
     def cancel(self) -> Future | None:
         """Ask the running goal to stop; returns the answer, None = no goal runs. Its status shows when it has ended."""
-        request = self._interface.Request()
+        request = CancelGoal.Request()
         with self._lock:
             if not self._running:
                 return None
