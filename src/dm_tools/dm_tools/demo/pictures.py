@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
@@ -80,8 +79,8 @@ def save_animation(
     cursor = right.axvline(0.0, color="black", linewidth=0.8)
     # A cross on the middle of the picture shows that it stands still.
     height, width = sweep.sharp.shape
-    cross = left.axhline(height / 2), left.axvline(width / 2)
-    setp(cross, color="#F0E442", linewidth=0.8, visible=False)
+    hidden: dict[str, Any] = {"color": "#F0E442", "linewidth": 0.8, "visible": False}
+    cross = left.axhline(height / 2, **hidden), left.axvline(width / 2, **hidden)
     depth = right.inset_axes((0, 0, 1, 1))
     depth.set(visible=False, xticks=[], yticks=[])
     depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest", aspect="auto")
@@ -111,11 +110,13 @@ def save_animation(
         show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
 
     def stand(shown: int) -> None:
-        setp(cross, visible=True)
+        for line in cross:
+            line.set_visible(True)
         show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
 
     def everything(_shown: int) -> None:
-        setp(cross, visible=False)
+        for line in cross:
+            line.set_visible(False)
         picture.set_data(sweep.sharp)
         depth.set(visible=True)
         right.set_axis_off()
