@@ -60,6 +60,12 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
         yield client
 
 
+def heard(client: DeformableMirrorClient, topic: str, timeout_s: float) -> Any:
+    """The latest message of a topic that the client follows; None = none came in time."""
+    client.wait(lambda: topic in client.messages, timeout_s)
+    return client.messages.get(topic)
+
+
 def promise(bound: float) -> str:
     """A 95 % bound on the largest coefficient error (m) as text, the same in all verbs."""
     if not bound > 0.0:
@@ -116,8 +122,7 @@ def holder(client: DeformableMirrorClient) -> str:
     from dm_client.client import INTERFACES
     from dm_tools.long_actions import LONG, ExternalGoals
 
-    client.wait(lambda: "actuator_state" in client.messages, BUSY_S)
-    state = client.messages.get("actuator_state")
+    state = heard(client, "actuator_state", BUSY_S)
     if state is None or not state.holder:
         return ""
     holding = state.holding.partition(": ")[0]  # without the driver's hint how to end it: the commands give their own
@@ -156,18 +161,18 @@ def hear_health(client: DeformableMirrorClient, times: list[int] | None = None) 
     """{node: its latest status on /diagnostics}, filled from now on, as is `times` with times of the bench, s."""
     from diagnostic_msgs.msg import DiagnosticArray
 
-    heard: dict[str, Any] = {}
+    health: dict[str, Any] = {}
 
     def take(message: Any) -> None:
         for status in message.status:
             place, _, name = status.name.rpartition("/")
             if place == client.node.get_namespace().lstrip("/"):
-                heard[name] = status
+                health[name] = status
                 if times is not None and name in NEEDED:
                     times.append(message.header.stamp.sec)
 
     client.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
-    return heard
+    return health
 
 
 class SettledShape(NamedTuple):

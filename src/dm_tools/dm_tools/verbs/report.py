@@ -13,7 +13,7 @@ import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 from dm_tools.parameter_changes import get_parameter
-from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
+from dm_tools.running_suite import BUSY_S, FIND_S, heard, nodes_of_suite
 
 #: Stores of the node `calibration`: that of the shipped virtual bench, and the default.
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
@@ -28,9 +28,8 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
     from dm_client import DeformableMirrorClient, DeformableMirrorError
 
     with DeformableMirrorClient(namespace) as client:
-        if client.wait(lambda: nodes_of_suite(client), FIND_S):
-            client.wait(lambda: "calibration" in client.messages, BUSY_S)
-        if (message := client.messages.get("calibration")) is None:
+        runs = client.wait(lambda: nodes_of_suite(client), FIND_S)
+        if not runs or (message := heard(client, "calibration", BUSY_S)) is None:
             return None, JUDGED_BY, ""
         values = JUDGED_BY
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)
