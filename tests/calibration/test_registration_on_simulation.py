@@ -16,7 +16,7 @@ from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.optics.orientation import Orientation
-from dm_calibration.procedure.map_acquisition import check_comparable
+from dm_calibration.procedure.map_comparison import check_comparable
 from dm_calibration.procedure.outcome import Outcome
 from dm_common.errors import MeasurementError
 from dm_common.geometry import hexagonal_positions

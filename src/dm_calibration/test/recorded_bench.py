@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
+from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, plan_text
 from hysteretic_mirror import MIRROR, lagging_bench
 

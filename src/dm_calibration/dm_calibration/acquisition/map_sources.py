@@ -14,7 +14,7 @@ from dm_calibration.hysteresis.response_fit import check_signals
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
-from dm_calibration.procedure.map_acquisition import check_comparable
+from dm_calibration.procedure.map_comparison import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
 from dm_common import Floats
 from dm_common.errors import MeasurementError

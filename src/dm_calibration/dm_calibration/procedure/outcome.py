@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
@@ -174,6 +174,14 @@ class Outcome:
         if not self.records:
             raise TooFewMapsError("no map was measured; " + "; ".join(self.dropped[:3]))
         return MapSet.of(self.records)
+
+    def maps_before_solving(self, kind: StepKind) -> MapSet:
+        """The maps before the first solved shape of a kind, so that an interruption does not change the model."""
+        maps = self.maps()
+        solved = np.array([one == kind for one in maps.kind])
+        if kind is StepKind.SURFACE:
+            solved &= np.isfinite(maps.nominal).any(axis=1)
+        return maps.select(~np.logical_or.accumulate(solved))
 
     def _add(self, record: Measurement, centre: tuple[float, float]) -> None:
         self.records.append(record)

@@ -6,26 +6,55 @@ its maps with a degauss, since the history of the actuators is not known meanwhi
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dm_calibration.influence.fit import fit_influence
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
-from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
-from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, without_map
+from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
+from dm_calibration.procedure.map_comparison import check_comparable
+from dm_calibration.procedure.outcome import (
+    Doubted,
+    Dropped,
+    Event,
+    MapTaken,
+    Outcome,
+    Segment,
+    Setup,
+    Solved,
+    without_map,
+)
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, shape_in_use
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench
-from dm_common.mirror import Mirror
-
-__all__ = ["Outcome", "Procedure", "ProcedureOptions", "Progress"]
+from dm_common.mirror import APERTURE_TOLERANCE, Mirror
+from dm_common.values import live_parameter, whole
 
 #: Maps of the mirror at rest when a hysteresis run is resumed: they show the present figure.
 RESUME_MAPS = 3
+
+
+@dataclass(frozen=True)
+class ProcedureOptions:
+    """Retries and checks of the measurements.
+
+    Attributes:
+        aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
+        fit: options of the fit from which surfaces with a prescribed shape are solved.
+        bump: largest differences between reference frames.
+    """
+
+    measure_retries: int = live_parameter(whole(1, 0, 20), "Further tries after a map that failed.")
+    failures_max: int = live_parameter(
+        whole(3, 1, 1000), "Number of shapes in a row without a map after which a run is given up."
+    )
+    maps_per_state: int = 1
+    aperture_tolerance: float = APERTURE_TOLERANCE
+    fit: FitOptions = field(default_factory=FitOptions)
+    bump: BumpOptions = field(default_factory=BumpOptions)
 
 
 @dataclass(frozen=True)
@@ -77,7 +106,10 @@ class Procedure:
         self._cancelled, self._guard = cancelled, guard
         self._failures = 0
         self._enough = enough
-        self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)
+        self._bump = BumpCheck(self._options.bump, mirror.rest, mirror.limits.half_range)
+        for record, centre in zip(self.outcome.records, self.outcome.centres, strict=True):
+            self._bump.take(MapTaken(record, centre=centre))
+        self._swung = False  # since the last map: degaussed after an interruption, and perhaps moved or realigned
 
     def run(self) -> Outcome:
         """Go through all steps that are not done yet.
@@ -125,7 +157,8 @@ class Procedure:
             self._report(f"degauss (resumed after {last})", StepKind.DEGAUSS, done)
             self._bench.degauss()
         self._note(Segment(self.outcome.segment + 1, time.time_ns()))
-        self._maps.swung()
+        self._bump.degaussed()
+        self._swung = True
         step = Step(f"reference resumed {self.outcome.segment}", StepKind.REFERENCE, self._mirror.rest)
         self._report(step.label, step.kind, done)
         repeats = max(self._options.maps_per_state, RESUME_MAPS if self._plan.kind is PlanKind.HYSTERESIS else 1)
@@ -155,7 +188,7 @@ class Procedure:
         try:
             model = self._model or self._models.get(step.kind)
             if model is None:
-                maps = self._maps_before_solving(step.kind)
+                maps = self.outcome.maps_before_solving(step.kind)
                 model = self._models[step.kind] = fit_influence(maps, self._options.fit, rings=self._mirror.rings)
             if step.in_use:
                 return shape_in_use(step, model, self._mirror)
@@ -169,14 +202,6 @@ class Procedure:
         self._note(Solved(surface.target, surface.remark))
         return replace(step, signals=surface.signals, nominal=surface.nominal)
 
-    def _maps_before_solving(self, kind: StepKind) -> MapSet:
-        """The maps before the first solved shape of a kind, so that an interruption does not change the model."""
-        maps = self.outcome.maps()
-        solved = np.array([one == kind.value for one in maps.kind])
-        if kind is StepKind.SURFACE:
-            solved &= np.isfinite(maps.nominal).any(axis=1)
-        return maps.select(~np.logical_or.accumulate(solved))
-
     def _measure_state(self, step: Step, number: int, repeats: int) -> None:
         assert step.signals is not None
         applied = self._bench.apply(step.signals)
@@ -187,7 +212,7 @@ class Procedure:
         for repeat in range(self.outcome.tried(number), repeats):
             label = step.label if repeat == 0 else f"{step.label} ({repeat + 1})"
             try:
-                self._maps.take(label, step, number, applied)
+                self._take(label, step, number, applied)
                 taken += 1
             except MeasurementError as error:
                 self._note(Dropped(number, f"{label}: {error}"))
@@ -197,6 +222,66 @@ class Procedure:
         self._failures = 0 if taken else self._failures + 1
         if self._failures >= self._options.failures_max:
             raise Refusal(failure.error_code, f"{self._failures} states in a row gave no map; the last: {failure}")
+
+    def _take(self, label: str, step: Step, number: int, applied: Floats) -> None:
+        """Take a map of the present state, the signals `applied` (N,); `number`: of the state in the run.
+
+        Raises MeasurementError if every try failed, Refusal if two reference frames show that the mirror was bumped.
+        """
+        for attempt in range(self._options.measure_retries + 1):
+            self._checkpoint()
+            try:
+                taken = self._map(label, step, number, applied)
+                break
+            except MeasurementError as error:
+                if attempt == self._options.measure_retries:
+                    tries = f" ({attempt + 1} tries)" if attempt else ""
+                    raise MeasurementError(error.error_code, f"{error}{tries}") from error
+        if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._swung):
+            taken = self._map(label, step, number, applied)  # bad map, or moved mirror: a second map decides
+            if suspicion := self._bump.change(taken, self._swung):
+                self._stop_bumped(label, suspicion)
+        self._note(taken)
+        self._bump.take(taken)
+        self._swung = False
+
+    def _stop_bumped(self, label: str, suspicion: str) -> None:
+        """End the run; the maps since the last good reference frame are in doubt."""
+        if self._swung:
+            raise Refusal(
+                ErrorCode.MAP_REJECTED,
+                f"{label}: {suspicion}: the mirror does not stand as it did before the run was interrupted. Put it "
+                "back, or begin anew (`dm calibrate --fresh`)",
+            )
+        frames = [index for index, record in enumerate(self.outcome.records) if record.kind == StepKind.REFERENCE]
+        doubtful = len(self.outcome.records) - frames[-1] - 1
+        self._note(Doubted(frames[-1] + 1, f"in doubt, bumped before {label}"))
+        raise Refusal(
+            ErrorCode.MAP_REJECTED,
+            f"{label}: {suspicion}: the mirror or the interferometer was bumped. The {doubtful} maps since are in "
+            "doubt; put the mirror back and start again to go on from the last good reference frame",
+        )
+
+    def _map(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
+        """Take a map that is comparable with the others."""
+        measured = self._bench.measure(label)
+        self._guard()
+        check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
+        if self.outcome.setup is None:
+            self._note(Setup.of(measured))
+        assert step.signals is not None
+        record = replace(
+            measured,
+            label=label,
+            kind=step.kind.value,
+            step=number,
+            signals=step.signals,
+            applied=applied,
+            nominal=step.nominal,
+            segment=self.outcome.segment,
+        )
+        metres = self._mirror.working_radius / measured.radius_px if measured.radius_px > 0.0 else np.nan
+        return MapTaken(record, measured.radius > 0.0, (measured.centre[0] * metres, measured.centre[1] * metres))
 
     def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
         """If hysteresis is to be identified, keep a command without a map: it is part of the actuators' history.

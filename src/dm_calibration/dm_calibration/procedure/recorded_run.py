@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
-from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
+from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_common import Floats
 from dm_common.errors import ErrorCode, MeasurementError
 from dm_common.measurement import Measurement

@@ -14,7 +14,7 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
-from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
+from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described, without_response, worst_elsewhere

@@ -83,7 +83,7 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     from dm_calibration.acquisition.reference_surface import difference
     from dm_calibration.map_files.fits import fits_bytes
     from dm_calibration.optics.flats import FlatTest, reference_from_flats
-    from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
+    from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
 
     rows = _table(table, "file", "reference", "part", "degrees")
     sources = [table.parent / row[0] for row in rows]
