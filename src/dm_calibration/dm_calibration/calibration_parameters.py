@@ -120,7 +120,7 @@ def procedure_options(values: Mapping[str, Any], maps_per_state: int = 1) -> Pro
         values,
         maps_per_state=maps_per_state,
         fit=fit_options(values),
-        bump=from_values(BumpOptions, values, "bump.", hysteresis_allowance=values["hysteresis_allowance"]),
+        bump=from_values(BumpOptions, values, "bump."),
     )
 
 

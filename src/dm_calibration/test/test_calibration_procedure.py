@@ -96,7 +96,7 @@ def test_a_reference_frame_may_differ_by_what_a_degauss_wiped(bench: LinearBench
     reference, poke = (MapTaken(record) for record in run(bench, mirror).outcome.records[:2])
     change = 0.8 * (poke.record.coefficients - reference.record.coefficients)
     changed = MapTaken(replace(reference.record, coefficients=reference.record.coefficients + change))
-    check = BumpCheck(BumpOptions(tilt_max=0.0), mirror.rest, mirror.limits.half_range)
+    check = BumpCheck(BumpOptions(tilt_max=0.0), mirror, 0.1)
     check.take(reference)
     check.take(poke)
     assert "the figure changed by" in check.change(changed, False)

@@ -12,6 +12,7 @@ import numpy as np
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.procedure.outcome import MapTaken
 from dm_common import Floats
+from dm_common.mirror import Mirror
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_common.values import live_parameter, real
 
@@ -24,12 +25,7 @@ _TOGETHER = 2.0
 
 @dataclass(frozen=True)
 class BumpOptions:
-    """Largest changes between two reference frames; 0 = not checked.
-
-    Attributes:
-        hysteresis_allowance: error of actuators as a share of their moves; twice that is allowed for, since actuators
-            that moved together err together.
-    """
+    """Largest changes between two reference frames; 0 = not checked."""
 
     tilt_max: float = live_parameter(
         real(3e-6, 0.0, 1e-3, "m"),
@@ -44,17 +40,17 @@ class BumpOptions:
         "Largest rms change of the figure between two reference frames, beyond what twice `hysteresis_allowance` "
         "explains; 0 = not checked.",
     )
-    hysteresis_allowance: float = 0.10
 
 
 class BumpCheck:
     """Compares each reference frame with the one before it."""
 
-    def __init__(self, options: BumpOptions, rest: Floats, half_range: float) -> None:
-        """`rest`: (N,) signals of the reference frames; `half_range`: reach of a degauss from there."""
-        self._options, self._rest, self._half_range = options, rest, half_range
+    def __init__(self, options: BumpOptions, mirror: Mirror, allowance: float) -> None:
+        """`allowance`: error of actuators as a share of their moves."""
+        self._options, self._allowance = options, allowance
+        self._rest, self._half_range = mirror.rest, mirror.limits.half_range
         self._last: MapTaken | None = None
-        self._moved = np.zeros_like(rest)
+        self._moved = np.zeros_like(self._rest)
         # Sums of squares: change in the maps (rms, m) and commanded change. The root of their ratio is the response.
         self._shown = self._commanded = 0.0
 
@@ -118,7 +114,7 @@ class BumpCheck:
         if not self._commanded:
             return float("inf")  # no map yet shows the size of the response
         response = np.sqrt(self._shown / self._commanded)
-        return float(_TOGETHER * self._options.hysteresis_allowance * response * np.linalg.norm(self._moved))
+        return float(_TOGETHER * self._allowance * response * np.linalg.norm(self._moved))
 
 
 def _figure_rms(coefficients: Floats) -> float:

@@ -106,7 +106,7 @@ class Procedure:
         self._cancelled, self._guard = cancelled, guard
         self._failures = 0
         self._enough = enough
-        self._bump = BumpCheck(self._options.bump, mirror.rest, mirror.limits.half_range)
+        self._bump = BumpCheck(self._options.bump, mirror, self._options.fit.hysteresis_allowance)
         for record, centre in zip(self.outcome.records, self.outcome.centres, strict=True):
             self._bump.take(MapTaken(record, centre=centre))
         self._swung = False  # since the last map: degaussed after an interruption, and perhaps moved or realigned
