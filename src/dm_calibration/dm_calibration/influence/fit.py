@@ -220,7 +220,8 @@ def _judge(
     standard_error = scatter * np.sqrt(np.diag(covariance))
 
     held = ~good.reference
-    held_out, tested = quality.held_out_residual(design, responses, good.step, held, options.folds)
+    fold = quality.folds_of(good.step, held, options.folds)
+    held_out, tested = quality.held_out_residual(design, responses, fold)
     judged = tested if tested.any() else held
     left = quality.seen_rms(held_out[:, terms:], good.sag, weight)[judged]
     in_sample = quality.seen_rms(residual[:, terms:], good.sag, weight)

@@ -50,11 +50,10 @@ def grade(
 
     A response is the weighted rms sag of a unit signal, piston and tilt removed.
     """
-    uncertainty = _relative(response, standard_error)
-    uncertain = uncertainty > STANDS_OUT * _typical(uncertainty, excited)
-    uncertain &= response < options.weak_sigmas * standard_error
+    uncertainty, typical = _uncertainty(response, standard_error, excited)
+    uncertain = (uncertainty > STANDS_OUT * typical) & (response < options.weak_sigmas * standard_error)
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
-    overall = float(np.median(response[excited])) if excited.any() else 0.0
+    overall = np.median(response[excited])
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
@@ -64,18 +63,15 @@ def grade(
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
 
 
-def _relative(response: Floats, standard_error: Floats) -> Floats:
-    """Standard errors (N,) as shares of the responses (N,)."""
-    return np.divide(standard_error, response, out=np.full(response.size, np.inf), where=response > 0.0)
-
-
-def _typical(uncertainty: Floats, excited: NDArray[np.bool_]) -> float:
-    return float(np.median(uncertainty[excited])) if excited.any() else 0.0
+def _uncertainty(response: Floats, standard_error: Floats, excited: NDArray[np.bool_]) -> tuple[Floats, float]:
+    """Standard errors (N,) as shares of the responses (N,), and their median over the actuators that were moved."""
+    share = np.divide(standard_error, response, out=np.full(response.size, np.inf), where=response > 0.0)
+    return share, float(np.median(share[excited]))
 
 
 def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], weak_sigmas: float) -> list[str]:
     """Sentences on responses (N,) that are all uncertain; empty if they are not."""
-    typical = _typical(_relative(response, standard_error), excited)
+    _, typical = _uncertainty(response, standard_error, excited)
     if typical * weak_sigmas < 1.0:
         return []
     return [
@@ -85,35 +81,31 @@ def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], w
 
 
 def folds_of(step: NDArray[np.int64], held: NDArray[np.bool_], folds: int) -> NDArray[np.int64]:
-    """(M,) fold of each map `held` (M,), dealt out by commanded states `step` (M,); -1 = it stays in every fit."""
+    """(M,) fold of each map `held` (M,); -1 = it stays in every fit.
+
+    Folds go by commanded states `step` (M,), so that repeated maps of a state stay together, and are dealt out in
+    order: the two directions of a push-pull poke lie in different folds. Reference frames should stay in every fit:
+    without them the figure of the day would be extrapolated, which is not what the influence function is judged by.
+    """
     fold = np.full(step.size, -1)
     fold[held] = np.unique(step[held], return_inverse=True)[1] % folds
     return fold
 
 
-def held_out_residual(
-    design: Design, responses: Floats, step: NDArray[np.int64], held: NDArray[np.bool_], folds: int
-) -> tuple[Floats, NDArray[np.bool_]]:
+def held_out_residual(design: Design, responses: Floats, fold: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
     """Residual of each map predicted from a fit that has not seen it, by k-fold cross-validation.
-
-    Folds go by commanded state, so that repeated maps of a state stay together, and are dealt out in order: the two
-    directions of a push-pull poke lie in different folds. Reference frames stay in every fit: without them the figure
-    of the day would be extrapolated, which is not what the influence function is judged by.
 
     Args:
         design: (M, p).
         responses: (M, Q).
-        step: (M,) index of the commanded state.
-        held: (M,) which maps take their turn (all but the reference frames).
-        folds: number of folds, at least 2.
+        fold: (M,) as from :func:`folds_of`.
 
     Returns:
         The residual (M, Q), and which maps (M,) were tested. A map whose prediction is EXTRAPOLATION_MAX times as
         uncertain as a measurement is not, because the fit without its fold knows too little about what it moves.
     """
-    fold = folds_of(step, held, folds)
     residual = np.full(responses.shape, np.nan)
-    inflation = np.full(step.size, np.inf)
+    inflation = np.full(fold.size, np.inf)
     for k in range(int(fold.max(initial=-1)) + 1):
         left_out = fold == k
         # Where a fold holds the only map that separates two actuators, this is the minimum-norm solution.

@@ -116,7 +116,7 @@ def choose_weighting(
     scale = float(np.median(variance))
 
     # Which held-out predictions are extrapolation does not depend on the responses, so any column will do.
-    _, tested = quality.held_out_residual(design, sag[:, :1], maps.step, chosen, folds)
+    _, tested = quality.held_out_residual(design, sag[:, :1], fold)
     tested = tested if tested.any() else chosen
     squares = np.zeros(fractions.size)
     modes = basis(maps.points.x, maps.points.y)
