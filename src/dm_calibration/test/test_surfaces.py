@@ -66,8 +66,6 @@ def test_surfaces_a_smaller_mirror_cannot_have() -> None:
     assert surfaces.missing_on("p24", small) == ""
     assert surfaces.missing_on("p25", small) == "p25 moves actuator 20; the mirror has 19"
     assert surfaces.missing_on("p45", small) == "p45 moves circle 4 of actuators; the mirror has 3"
-    with pytest.raises(ValueError, match="p25 moves actuator 20"):
-        surfaces.signal_surface("p25", small)
     assert (surfaces.signal_surface("p44", small).signals == np.where(small.rings == 2, 1.0, -1.0)).all()
 
 

@@ -60,14 +60,12 @@ class Surface:
     """A sample surface ready to be commanded.
 
     Attributes:
-        name: as in Table 1.
         signals: (N,) normalised, inside the mirror's limits.
         nominal: (21,) Zernike coefficients of the shape aimed at, m; None when signals were prescribed.
         remark: what the mirror's limits changed; "" = nothing.
         target: the shape aimed at and how far it is out of reach; "" when signals were prescribed.
     """
 
-    name: str
     signals: Floats
     nominal: Floats | None = None
     remark: str = ""
@@ -98,13 +96,8 @@ def missing_on(name: str, mirror: Mirror) -> str:
 def signal_surface(name: str, mirror: Mirror) -> Surface:
     """A surface with prescribed signals (p01-p54), scaled about its mean when it breaks a limit of the mirror.
 
-    Table 1's -1 and +1 are the ends of the signal range.
-
-    Raises:
-        ValueError: the mirror has no such actuator or ring.
+    Table 1's -1 and +1 are the ends of the signal range. The mirror must have the actuators, see :func:`missing_on`.
     """
-    if reason := missing_on(name, mirror):
-        raise ValueError(reason)
     table = np.full(mirror.actuators, -1.0)
     if name in _LEVELS:
         table[:] = _LEVELS[name]
@@ -117,7 +110,7 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
     middle, half = mirror.rest[0], mirror.limits.half_range
     signals, factor = mirror.limits.scaled(middle + half * table)
     remark = "" if factor == 1.0 else f"{name}: scaled about its mean to {factor:.0%} to keep the mirror's limits"
-    return Surface(name, signals, remark=remark)
+    return Surface(signals, remark=remark)
 
 
 def solve_shape(
@@ -175,7 +168,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
         if tilt:  # a coefficient that is not known in metres counts as 0 after removal of tilt
             signals, _ = mirror.limits.scaled(flat + amplitude * direction)
             target = f"{name}: Z_1^1 as a plane of signals of +-{amplitude:.2f}; its size in metres is not measured"
-            return Surface(name, signals, 0.0 * unit, target=target)
+            return Surface(signals, 0.0 * unit, target=target)
         nominal = amplitude * unit
         wanted = f"{ZERNIKE_NAMES[_ZERNIKES[name]]} of {amplitude * 1e9:.0f} nm"
     signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
@@ -185,7 +178,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
     if factor < 1.0:
         nominal = factor * nominal
         remark = f"{name}: reduced to {factor:.0%} of the {wanted} to keep the limit between neighbours"
-    return Surface(name, signals, nominal, remark, described)
+    return Surface(signals, nominal, remark, described)
 
 
 def _damped(model: LinearModel) -> tuple[Floats, float]:
