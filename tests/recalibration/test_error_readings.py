@@ -56,7 +56,7 @@ def test_the_test_maps_have_no_say_in_their_prediction(reading: Reading) -> None
     coefficients[rows] *= 3.0
     after = regress_surface_errors(replace(maps, sag=sag, coefficients=coefficients), fit, reading)
     assert after.fit.variables == before.fit.variables
-    assert after.fit.parameters == pytest.approx(before.fit.parameters, rel=1e-9)
+    assert after.fit.result.params == pytest.approx(before.fit.result.params, rel=1e-9)
     assert after.table3[0].actual != pytest.approx(before.table3[0].actual)
     if reading in (Reading.COMMAND, Reading.HISTORY):  # nothing measured on the surface enters
         assert [row.predicted for row in after.table3] == pytest.approx([row.predicted for row in before.table3])

@@ -44,9 +44,9 @@ def test_finds_the_variables_that_matter_and_agrees_with_statsmodels(sm: Any) ->
     y = 50e-9 + 8e-9 * x[:, 3] - 5e-3 * x[:, 40] + 1e-9 * np.random.default_rng(2).standard_normal(50)
     fit = stepwise(x, y, NAMES, options=SelectionOptions(1e-4, 2e-4))
     assert set(fit.variables) == {"x3", "x40"}
-    assert (fit.n, fit.k) == (50, 2)
+    assert (fit.result.nobs, len(fit.variables)) == (50, 2)
     reference = sm.OLS(y, sm.add_constant(x[:, list(fit.columns)])).fit()
-    assert fit.parameters == pytest.approx(reference.params, rel=1e-9)
+    assert fit.result.params == pytest.approx(reference.params, rel=1e-9)
     assert (fit.adjusted_r2, fit.f_statistic) == pytest.approx((reference.rsquared_adj, reference.fvalue))
     assert fit.result.mse_resid == pytest.approx(reference.mse_resid)
     assert fit.p_value == pytest.approx(reference.f_pvalue)
@@ -77,7 +77,7 @@ def test_weights_are_those_of_weighted_least_squares(sm: Any) -> None:
     fit = stepwise(x, y, NAMES[:3], weights, SelectionOptions(1e-6, 1e-5))
     assert fit.variables == ("x1",)
     reference = sm.WLS(y, sm.add_constant(x[:, 1]), weights=weights).fit()
-    assert fit.parameters == pytest.approx(reference.params, rel=1e-9)
+    assert fit.result.params == pytest.approx(reference.params, rel=1e-9)
     mean, lower, upper = fit.predict(x, weights)
     inside = (lower <= y) & (y <= upper)
     light = weights < 0.2
@@ -150,7 +150,7 @@ def test_freedom_is_left_however_mild_the_thresholds() -> None:
     x = candidates(10)
     y = np.random.default_rng(11).standard_normal(50)
     fit = stepwise(x, y, NAMES, options=SelectionOptions(0.98, 0.99))
-    assert fit.n - fit.k - 1 == FREEDOM_MIN and fit.k > 10
+    assert fit.result.nobs - len(fit.variables) - 1 == FREEDOM_MIN and len(fit.variables) > 10
 
 
 def _duplicate(x: np.ndarray) -> None:

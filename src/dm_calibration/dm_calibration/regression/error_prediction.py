@@ -41,15 +41,15 @@ class ErrorPrediction:
         with self._lock:
             predictor = self._fitted(stored, request.method or stored.fit.method, options)
             self._of, self._predictor = stored.id, predictor
-        fit, held_out = predictor.fit, predictor.held_out_rms
+        fit, samples = predictor.fit, int(predictor.fit.result.nobs)
         response.adjusted_r2, response.f_statistic, response.p_value = fit.adjusted_r2, fit.f_statistic, fit.p_value
-        response.samples = fit.n
+        response.samples = samples
         response.variables = list(fit.variables)
-        response.parameters = doubles(fit.parameters)
-        response.held_out_rms = held_out
+        response.parameters = doubles(fit.result.params)
+        response.held_out_rms = predictor.held_out_rms
         response.message = (
-            f"{predictor.influence.method} on {fit.n} surfaces of {stored.id}: {fit.k} variables, held-out error "
-            f"{held_out * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
+            f"{predictor.influence.method} on {samples} surfaces of {stored.id}: {len(fit.variables)} variables, "
+            f"held-out error {predictor.held_out_rms * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
         )
         return response
 

@@ -57,12 +57,12 @@ class SelectionOptions:
 
 @dataclass(frozen=True, eq=False)
 class StepwiseFit:
-    """The selected model y = parameters[0] + sum_j parameters[j] x_j. Units: those of the response, per unit of x_j.
+    """The selected model y = params[0] + sum_j params[j] x_j. Units: those of the response, per unit of x_j.
 
     Attributes:
         variables: (k,) names, in the order in which they entered.
         columns: (k,) their columns among the candidates.
-        result: of statsmodels for the selected model.
+        result: of statsmodels for the selected model, with its params (k + 1,) and number of samples nobs.
     """
 
     variables: tuple[str, ...]
@@ -70,34 +70,19 @@ class StepwiseFit:
     result: Any
 
     @property
-    def parameters(self) -> Floats:
-        """(k + 1,) the constant first."""
-        return np.asarray(self.result.params)
-
-    @property
-    def n(self) -> int:
-        """Samples."""
-        return int(self.result.nobs)
-
-    @property
-    def k(self) -> int:
-        """Selected variables."""
-        return len(self.columns)
-
-    @property
     def adjusted_r2(self) -> float:
         """Of the selected model; 0 without variables. Optimistic: see the module."""
-        return float(self.result.rsquared_adj) if self.k else 0.0
+        return float(self.result.rsquared_adj) if self.variables else 0.0
 
     @property
     def f_statistic(self) -> float:
         """Of the model against the constant; 0 without variables."""
-        return float(self.result.fvalue) if self.k else 0.0
+        return float(self.result.fvalue) if self.variables else 0.0
 
     @property
     def p_value(self) -> float:
         """Of the F statistic; 1 without variables. Optimistic: see the module."""
-        return float(self.result.f_pvalue) if self.k else 1.0
+        return float(self.result.f_pvalue) if self.variables else 1.0
 
     def predict(self, candidates: ArrayLike, weights: ArrayLike | None = None) -> tuple[Floats, Floats, Floats]:
         """Mean and 95 % prediction interval of new samples, without the uncertainty of the selection itself.
