@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.acquisition.reference_surface import absolute_sag
+from dm_calibration.acquisition.reference_surface import difference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
 from dm_calibration.optics.aperture import (
     Aperture,
@@ -161,8 +161,7 @@ class Ingest:
     def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         if not source.wavelength:  # not given in the file
             source = replace(source, wavelength=settings.wavelength)
-        difference = abs(source.wavelength - settings.wavelength)
-        if settings.wavelength and difference > settings.wavelength_tolerance:
+        if settings.wavelength and abs(source.wavelength - settings.wavelength) > settings.wavelength_tolerance:
             raise MapRejectedError(
                 f"wavelength = {source.wavelength * 1e9:.3f} nm: must be {settings.wavelength * 1e9:.3f} nm within "
                 f"{settings.wavelength_tolerance * 1e9:g} nm (parameters wavelength.expected, wavelength.tolerance)"
@@ -174,8 +173,9 @@ class Ingest:
         pitch = settings.pitch or source.pitch
         sag, subtracted = source.sag, source.system_error_subtracted
         if settings.reference is not None:
-            sag = absolute_sag(source, settings.reference, settings.pitch, settings.wavelength_tolerance)
-            subtracted = True
+            if different := difference(source, settings.reference, settings.pitch, settings.wavelength_tolerance):
+                raise MapRejectedError(different)
+            sag, subtracted = sag - settings.reference.sag, True
         if settings.retrace:
             sag = without_retrace(sag, settings.retrace)
         if settings.distortion:

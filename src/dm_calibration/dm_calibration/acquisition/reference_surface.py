@@ -4,8 +4,6 @@ from pathlib import Path
 
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
-from dm_calibration.optics.aperture import MapRejectedError
-from dm_common import Floats
 
 #: Name of the reference surface in messages: that of the parameter with its file.
 NAME = "reference_surface"
@@ -32,27 +30,13 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
     return reference
 
 
-def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float) -> Floats:
-    """(height, width) m, a map as the instrument shows it less the reference surface; NaN where either has no data.
-
-    Args:
-        pitch: m per pixel, for files that do not contain it; 0 = not known.
-
-    Raises:
-        MapRejectedError: see :func:`difference`.
-    """
-    if different := difference(source, reference, pitch, wavelength_tolerance):
-        raise MapRejectedError(different)
-    return source.sag - reference.sag
-
-
 def difference(
     source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float, name: str = NAME
 ) -> str:
     """Why a map cannot be compared with a reference, called `name` in the sentence; "" = it can.
 
     Either they differ in size, place on the camera, pitch or wavelength, or the instrument has already subtracted its
-    error from the map. Args as for :func:`absolute_sag`.
+    error from the map. `pitch`: m per pixel, for files that do not contain it; 0 = not known.
     """
     size = "{1} x {0} pixels from column {2}, row {3} of the camera"
     here, there = ((*each.sag.shape, *each.origin) for each in (source, reference))
