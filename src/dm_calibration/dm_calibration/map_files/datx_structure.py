@@ -71,7 +71,7 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.flo
         no_data: values from this one upwards mean no data; NaN = only those that are not finite do.
 
     Raises:
-        MapFileError: not a table of numbers, or one whose storage is not as declared.
+        MapFileError: not a table of numbers, one whose storage is not as declared, or a filter is not available.
     """
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
         raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
@@ -90,11 +90,7 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.flo
 
 
 def _check_storage(surface: h5py.Dataset, length: int) -> None:
-    """Compare the declared size of the map with what is stored in the file of `length` bytes.
-
-    Raises:
-        MapFileError: the values are in another file, or more or fewer than are stored.
-    """
+    """Compare the declared size of the map with what is stored in the file of `length` bytes."""
     if surface.external or surface.is_virtual:
         raise MapFileError(f"{surface.name}: its values lie in another file, which is not followed")
     stored, needed = surface.id.get_storage_size(), surface.size * surface.dtype.itemsize
@@ -120,9 +116,6 @@ def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
     """Check the address of the values, which the file states only once; a damaged one is too low or too high.
 
     If the map has corners without data, runs of "No Data" are then found within a row before the range, or behind it.
-
-    Raises:
-        MapFileError: such runs are found, and no other dataset can explain them.
     """
     start = surface.id.get_offset()
     if start is None or surface.dtype.kind != "f":  # stored in chunks, or integers, which have no such value
@@ -152,11 +145,7 @@ def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
 
 
 def _read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
-    """The stored values as (height, width) float64.
-
-    Raises:
-        MapFileError: a compression filter is not available.
-    """
+    """The stored values as (height, width) float64."""
     properties = surface.id.get_create_plist()
     for index in range(properties.get_nfilters()):
         identifier, _flags, _values, name = properties.get_filter(index)

@@ -112,11 +112,7 @@ def _phase_section(intensities: int, body: bytes) -> bytes:
 
 
 def parse_asc(content: bytes) -> SurfaceMap:
-    """Parse a whole `.asc` file ("Zygo ASCII Data File - Format 2").
-
-    Raises:
-        MapFileError: not a complete, meaningful map; the message names the field.
-    """
+    """Parse a whole `.asc` file ("Zygo ASCII Data File - Format 2"). Raises MapFileError as :func:`parse_xyz`."""
     header, body = read_header(content)
     pixels = check_size(header["width"], header["height"])
     metres_per_count = sag_per_count(header)

@@ -110,8 +110,8 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
 
     Raises:
         UnknownNameError: a surface that is not in Table 1; the message names similar ones.
-        ValueError: a surface was requested that this mirror cannot make or the plan does not measure, or an option is
-            out of range.
+        ValueError: a surface was requested that this mirror cannot make or the plan does not measure, an option is out
+            of range, or a plan for hysteresis would not begin with a degauss.
         TooFewMapsError: too few maps to identify the hysteresis of all actuators.
     """
     options = options or PlanOptions()
@@ -135,11 +135,7 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
 
 
 def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
-    """A degauss, repeated maps at rest, and the excitation with its degausses, each followed by a map at rest.
-
-    Raises:
-        TooFewMapsError, ValueError: as `excitation`; ValueError also if the run would not begin with a degauss.
-    """
+    """A degauss, repeated maps at rest, and the excitation with its degausses, each followed by a map at rest."""
     if not options.degauss:
         raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
     first, *more = _parts(options, mirror.actuators)
