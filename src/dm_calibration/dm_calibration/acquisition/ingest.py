@@ -5,7 +5,6 @@ from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.acquisition.reference_surface import difference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
@@ -20,6 +19,7 @@ from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
 from dm_calibration.optics.phase_steps import mend_phase_steps
+from dm_common import Bools
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
@@ -228,9 +228,7 @@ class Ingest:
         return surface, measured
 
     @staticmethod
-    def _aperture(
-        valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings
-    ) -> tuple[Aperture, tuple[float, float]]:
+    def _aperture(valid: Bools, pitch: float | None, settings: IngestSettings) -> tuple[Aperture, tuple[float, float]]:
         """The aperture, and the value of `Measurement.followed`."""
         nothing = (0.0, 0.0)
         if settings.aperture_radius == 0:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
@@ -16,7 +16,7 @@ from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.procedure.map_comparison import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
@@ -153,7 +153,7 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
         raise type(error)(f"map {number + 1}: {error}") from error
 
 
-def _kinds(away: NDArray[np.bool_], hysteresis: bool) -> list[StepKind]:
+def _kinds(away: Bools, hysteresis: bool) -> list[StepKind]:
     """(M,) kinds that a run would have given the maps; `away` (M, N): which actuators are away from rest."""
     if hysteresis:
         tested = round((1.0 - CHECK_SHARE) * len(away))

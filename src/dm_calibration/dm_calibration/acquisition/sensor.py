@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import SurfaceMap
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import basis
@@ -23,7 +23,7 @@ Seen = tuple[SurfaceMap, float]
 
 
 @cache
-def disc_terms() -> NDArray[np.float64]:
+def disc_terms() -> Floats:
     """The terms over a map, (PIXELS, PIXELS, 21), NaN outside the disc that touches the edges; row 0 = top."""
     centres = (2.0 * np.arange(PIXELS) + 1.0) / PIXELS - 1.0
     x, y = np.meshgrid(centres, -centres)

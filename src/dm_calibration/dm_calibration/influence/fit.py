@@ -26,7 +26,7 @@ from dm_calibration.influence.regression import (
     regress,
 )
 from dm_calibration.influence.screening import FitOptions
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.errors import unknown_name
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
@@ -68,7 +68,7 @@ class InfluenceFit:
     points: SamplePoints
     signal_min: float
     signal_max: float
-    used: NDArray[np.bool_]
+    used: Bools
     reasons: tuple[str, ...]
     map_residual: Floats
     in_sample_rms: float
@@ -91,7 +91,7 @@ def fit_influence(
     maps: MapSet,
     options: FitOptions | None = None,
     *,
-    rings: NDArray[np.int64] | None = None,
+    rings: Ints | None = None,
     limits: Limits | None = None,
     exclude: Collection[str] = (),
 ) -> InfluenceFit:
@@ -148,7 +148,7 @@ def fit_influence(
 class _Fitted(NamedTuple):
     """Which maps (M,) are used, these maps, the design of their regression, its result and its responses."""
 
-    used: NDArray[np.bool_]
+    used: Bools
     maps: MapSet
     design: Design
     regression: Regression
@@ -197,7 +197,7 @@ def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
 def _judge(
     maps: MapSet,
     options: FitOptions,
-    rings: NDArray[np.int64] | None,
+    rings: Ints | None,
     limits: Limits | None,
     reasons: list[str],
     fitted: _Fitted,

@@ -8,9 +8,8 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
@@ -51,10 +50,10 @@ class MapSet:
     points: SamplePoints
     label: tuple[str, ...]
     kind: tuple[str, ...]
-    step: NDArray[np.int64]
+    step: Ints
     signals: Floats
     applied: Floats
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Ints
     coefficients: Floats
     sigma: Floats
     sag: Floats
@@ -63,8 +62,8 @@ class MapSet:
     file: tuple[str, ...]
     sha256: tuple[str, ...]
     nominal: Floats
-    moved_ns: NDArray[np.int64]
-    segment: NDArray[np.int64]
+    moved_ns: Ints
+    segment: Ints
     temperature: Floats
 
     def __post_init__(self) -> None:
@@ -100,12 +99,12 @@ class MapSet:
         return int(self.coefficients.shape[1])
 
     @property
-    def reference(self) -> NDArray[np.bool_]:
+    def reference(self) -> Bools:
         """(M,) which maps are reference frames."""
         return np.array([kind == StepKind.REFERENCE for kind in self.kind], dtype=bool)
 
     @property
-    def degaussed(self) -> NDArray[np.bool_]:
+    def degaussed(self) -> Bools:
         """(M,) maps before which the mirror was degaussed in the course of the run."""
         again = np.concatenate(([False], np.diff(self.step) == 0))
         return np.array([kind == StepKind.DEGAUSSED for kind in self.kind], dtype=bool) & ~again
@@ -161,7 +160,7 @@ class MapSet:
             columns[name] = tuple(values) if isinstance(values[0], str) else np.array(values)
         return cls(**columns)
 
-    def select(self, keep: NDArray[np.bool_]) -> MapSet:
+    def select(self, keep: Bools) -> MapSet:
         """The maps where `keep` (M,) is true."""
         rows = np.flatnonzero(keep)
         changes: dict[str, Any] = {}

@@ -7,15 +7,12 @@ that remain belong to single actuators: dead, weak, inverted, exchanged with ano
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from dm_calibration.influence.registration import Registration, bumps, register, unit_responses
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch, rings
 from dm_common.optics.sampling import SamplePoints
-
-Indices = NDArray[np.int64]
 
 #: Turn (rad), shift (share of the pitch) and relative change of scale that still count as configured.
 TURN_MAX = np.radians(1.5)
@@ -52,7 +49,7 @@ class PokeCheck:
     """
 
     registration: Registration | None
-    place: Indices
+    place: Ints
     turned: bool = False
     findings: tuple[str, ...] = ()
 
@@ -81,8 +78,8 @@ def check_pokes(
     y: Floats,
     radius: float,
     *,
-    silent: NDArray[np.bool_],
-    unmoved: NDArray[np.bool_],
+    silent: Bools,
+    unmoved: Bools,
 ) -> PokeCheck:
     """Compare measured responses with the configured layout.
 
@@ -168,7 +165,7 @@ def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
     return sentences, bool(parts)
 
 
-def _places(table: Floats, active: Indices, double: dict[int, tuple[int, int]]) -> Indices:
+def _places(table: Floats, active: Ints, double: dict[int, tuple[int, int]]) -> Ints:
     """(N,) the place of each actuator; places other than its own count only where they fit clearly better."""
     table = table.copy()
     for actuator, pair in double.items():  # its own place if that is one of the two, else the first
@@ -213,7 +210,7 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
     return found
 
 
-def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _weak(size: Floats, height: Floats, ring: Ints, counted: Bools) -> Bools:
     """Actuators below WEAK_SHARE of their ring, both as measured and relative to the bump expected at their place."""
     weak = counted.copy()
     for number in np.unique(ring[counted]):
@@ -225,7 +222,7 @@ def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_
     return weak
 
 
-def cycles(place: Indices) -> list[tuple[int, ...]]:
+def cycles(place: Ints) -> list[tuple[int, ...]]:
     """The cycles of a permutation that are longer than 1, each from its smallest member on."""
     found: list[tuple[int, ...]] = []
     for start in range(place.size):
@@ -238,7 +235,7 @@ def cycles(place: Indices) -> list[tuple[int, ...]]:
     return found
 
 
-def _place_findings(place: Indices) -> list[str]:
+def _place_findings(place: Ints) -> list[str]:
     """The permutation in sentences."""
     findings = []
     for cycle in cycles(place):
@@ -253,7 +250,7 @@ def _place_findings(place: Indices) -> list[str]:
     return findings
 
 
-def _sign_findings(sign: Floats, active: Indices) -> list[str]:
+def _sign_findings(sign: Floats, active: Ints) -> list[str]:
     negative = sign < 0
     if 2 * negative.sum() <= active.size:
         return _named(negative, "move{} the surface the opposite way")
@@ -265,7 +262,7 @@ def _sign_findings(sign: Floats, active: Indices) -> list[str]:
     return _named(sign > 0, "move{} the opposite way to most others, which lower the surface as the signal rises")
 
 
-def _named(which: NDArray[np.bool_], text: str) -> list[str]:
+def _named(which: Bools, text: str) -> list[str]:
     """ "actuator 3 <text with s for {}>" or "actuators 3, 7 <text without>"; nothing when there is none."""
     numbers = np.flatnonzero(which) + 1
     if numbers.size == 0:

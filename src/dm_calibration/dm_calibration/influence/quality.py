@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import Design, seen_alike
 from dm_calibration.influence.screening import FitOptions
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
@@ -40,11 +40,7 @@ NO_RESPONSE = (GRADE_DEAD, GRADE_NOT_EXCITED)
 
 
 def grade(
-    response: Floats,
-    standard_error: Floats,
-    excited: NDArray[np.bool_],
-    rings: NDArray[np.int64] | None,
-    options: FitOptions,
+    response: Floats, standard_error: Floats, excited: Bools, rings: Ints | None, options: FitOptions
 ) -> NDArray[np.uint8]:
     """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal.
 
@@ -63,13 +59,13 @@ def grade(
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
 
 
-def _uncertainty(response: Floats, standard_error: Floats, excited: NDArray[np.bool_]) -> tuple[Floats, float]:
+def _uncertainty(response: Floats, standard_error: Floats, excited: Bools) -> tuple[Floats, float]:
     """Standard errors (N,) as shares of the responses (N,), and their median over the actuators that were moved."""
     share = np.divide(standard_error, response, out=np.full(response.size, np.inf), where=response > 0.0)
     return share, float(np.median(share[excited]))
 
 
-def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], weak_sigmas: float) -> list[str]:
+def blur(response: Floats, standard_error: Floats, excited: Bools, weak_sigmas: float) -> list[str]:
     """Sentences on responses (N,) that are all uncertain; empty if they are not."""
     _, typical = _uncertainty(response, standard_error, excited)
     if typical * weak_sigmas < 1.0:
@@ -80,7 +76,7 @@ def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], w
     ]
 
 
-def folds_of(step: NDArray[np.int64], held: NDArray[np.bool_], folds: int) -> NDArray[np.int64]:
+def folds_of(step: Ints, held: Bools, folds: int) -> Ints:
     """(M,) fold of each map `held` (M,); -1 = it stays in every fit.
 
     Folds go by commanded states `step` (M,), so that repeated maps of a state stay together, and are dealt out in
@@ -92,7 +88,7 @@ def folds_of(step: NDArray[np.int64], held: NDArray[np.bool_], folds: int) -> ND
     return fold
 
 
-def held_out_residual(design: Design, responses: Floats, fold: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+def held_out_residual(design: Design, responses: Floats, fold: Ints) -> tuple[Floats, Bools]:
     """Residual of each map predicted from a fit that has not seen it, by k-fold cross-validation.
 
     Args:
@@ -118,7 +114,7 @@ def held_out_residual(design: Design, responses: Floats, fold: NDArray[np.int64]
     return residual, inflation <= EXTRAPOLATION_MAX
 
 
-def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.bool_], allowance: float) -> float:
+def loop_share(left: Floats, moved: Floats, weight: Floats, tested: Bools, allowance: float) -> float:
     """Error by hysteresis that no law describes, as a share of a move over the range.
 
     A poke shows only the loop of its own actuator, so the residuals of held-out pokes are smaller than what all
@@ -174,9 +170,7 @@ def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     return float(np.linalg.cond(influence_zernike[first:] * rms))
 
 
-def limitations(
-    good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, tested: NDArray[np.bool_]
-) -> list[str]:
+def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, tested: Bools) -> list[str]:
     """What a user of an influence function fitted to the maps `good` must know, in sentences.
 
     Args:

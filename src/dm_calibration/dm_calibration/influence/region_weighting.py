@@ -13,13 +13,12 @@ mildest candidate is chosen and the result says so; a prior epsilon can be given
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence import quality
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress
 from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import AREA_FRACTIONS, regional_rms
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
@@ -74,7 +73,7 @@ class RegionWeighting:
         )
 
 
-def sample_surfaces(maps: MapSet) -> NDArray[np.bool_]:
+def sample_surfaces(maps: MapSet) -> Bools:
     """(M,) which maps the region variances are taken over: the surfaces of Table 1, else all but reference frames."""
     chosen = np.array([kind == StepKind.SURFACE for kind in maps.kind], dtype=bool)
     return chosen if np.unique(maps.step[chosen]).size >= SURFACES_MIN else ~maps.reference
@@ -150,9 +149,7 @@ def choose_weighting(
     )
 
 
-def weighting_of(
-    maps: MapSet, used: NDArray[np.bool_], folds: int = 10, epsilon: float | None = None
-) -> RegionWeighting:
+def weighting_of(maps: MapSet, used: Bools, folds: int = 10, epsilon: float | None = None) -> RegionWeighting:
     """Region weights of the maps of a calibration, for a command solve or a report; see :func:`choose_weighting`.
 
     Args:
@@ -182,7 +179,7 @@ def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
     return np.asarray(coefficients)
 
 
-def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool_]) -> Floats:
+def _variance(design: Design, maps: MapSet, sag: Floats, chosen: Bools) -> Floats:
     """(R,) variance over the chosen maps of the regional rms surface control error, G being that of AZreg."""
     coefficients = np.linalg.pinv(design.matrix, rcond=1e-9) @ maps.coefficients
     influence = np.zeros((maps.terms, maps.actuators))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
@@ -97,9 +97,9 @@ class _Match(NamedTuple):
     """
 
     similarity: _Similarity
-    place: NDArray[np.int64]
+    place: Ints
     distance: float
-    placed: NDArray[np.bool_]
+    placed: Bools
 
 
 def _seen(similarity: _Similarity, places: Places) -> Places:
@@ -120,7 +120,7 @@ def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
 
 
 def register(
-    unit: Floats, active: NDArray[np.int64], points: SamplePoints, x: Floats, y: Floats, radius: float
+    unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float
 ) -> Registration | None:
     """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
     all of them lie over one place or two.
@@ -151,7 +151,7 @@ def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, f
     return grid[tables[best].argmax(axis=1)], WIDTHS[best] * step
 
 
-def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: float) -> _Match:
+def _matched(seen: Places, active: Ints, places: Places, step: float) -> _Match:
     """The similarity and numbering that take the configured `places` to those `seen`."""
     spread = float(np.std(seen) / np.std(places))
     starts = [
@@ -215,7 +215,7 @@ def _refined(
     use = next((some for some in (inner, inside) if some.sum() >= INNER_MIN), match.placed).copy()
     mirrored, root = match.similarity.mirrored, np.sqrt(points.weight)
 
-    def residual(values: Floats, chosen: NDArray[np.bool_]) -> Floats:
+    def residual(values: Floats, chosen: Bools) -> Floats:
         factor = np.exp(values[0] + 1j * values[1])
         similarity = _Similarity(factor, complex(values[2], values[3]), mirrored)
         expected, _ = bumps(_seen(similarity, places[match.place[chosen]]), np.exp(values[4]), points)

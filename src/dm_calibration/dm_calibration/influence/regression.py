@@ -18,10 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
@@ -61,7 +60,7 @@ class Design:
 
     matrix: Floats
     drift: int
-    excited: NDArray[np.bool_]
+    excited: Bools
 
     @cached_property
     def basis(self) -> Floats:
@@ -86,7 +85,7 @@ class Regression:
     covariance: Floats
 
 
-def drift_columns(stamp_ns: NDArray[np.int64], reference: NDArray[np.bool_], step: NDArray[np.int64]) -> Floats:
+def drift_columns(stamp_ns: Ints, reference: Bools, step: Ints) -> Floats:
     """(M, R) columns of the design: hat functions of time with a knot at the mean time of each reference state.
 
     Repeated maps of a state, which follow each other, share its knot. Before the first and after the last knot the
@@ -157,13 +156,13 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     )
 
 
-def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats]:
+def complete_sag(maps: MapSet, model: Floats) -> tuple[Bools, Floats]:
     """Which maps hold data (M,), and their sag (M, P) m with piston and tilt removed; that of the others is zero.
 
     Args:
         model: (M, P) m, sag used to fill points without data.
     """
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
+    usable: Bools = np.asarray(np.isfinite(maps.sag).any(axis=1))
     sag = np.zeros_like(maps.sag)
     sag[usable] = fill_gaps(maps.sag[usable], model[usable], maps.points)
     return usable, sag
@@ -177,12 +176,12 @@ class SeenAlike(NamedTuple):
         inverse: (L, L) of 1 - lost lost^T; None where the other maps do not determine the unknowns.
     """
 
-    points: NDArray[np.int64]
+    points: Ints
     lost: Floats
     inverse: Floats | None
 
 
-def seen_alike(design: Design, seen: NDArray[np.bool_]) -> list[SeenAlike]:
+def seen_alike(design: Design, seen: Bools) -> list[SeenAlike]:
     """All sampling points, grouped by the set of maps that have data there, `seen` (M, P)."""
     _, first, which = np.unique(np.packbits(seen, axis=0), axis=1, return_index=True, return_inverse=True)
     found = []

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.map_files.surface_map import MapFileError, check_size
+from dm_common import Floats
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
@@ -64,7 +65,7 @@ def object_at(file: h5py.File, path: str) -> Any:
     return node
 
 
-def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.float64]:
+def read_heights(surface: Any, content: bytes, no_data: float) -> Floats:
     """(height, width) values of a map, NaN = no data, after its storage was checked against the whole file.
 
     Args:
@@ -144,7 +145,7 @@ def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
     return any(found)
 
 
-def _read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
+def _read_values(surface: h5py.Dataset) -> Floats:
     """The stored values as (height, width) float64."""
     properties = surface.id.get_create_plist()
     for index in range(properties.get_nfilters()):

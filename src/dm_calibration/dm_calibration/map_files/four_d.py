@@ -5,7 +5,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.map_files.datx_structure import as_text, missing, number_in, object_at, read_heights, required
 from dm_calibration.map_files.surface_map import (
@@ -16,6 +15,7 @@ from dm_calibration.map_files.surface_map import (
     check_pitch,
     check_wavelength,
 )
+from dm_common import Floats
 
 #: The groups by which files are recognised: of version 2 (.h5), and of newer ones (.4D).
 _OLD, _NEW = "measurement0", "Measurement"
@@ -52,7 +52,7 @@ def _newer(file: h5py.File, content: bytes) -> SurfaceMap:
     return _surface_map(read_heights(surface, content, np.nan), wavelength, None, "4D")
 
 
-def _surface_map(waves: NDArray[np.float64], wavelength: float, pitch: float | None, suffix: str) -> SurfaceMap:
+def _surface_map(waves: Floats, wavelength: float, pitch: float | None, suffix: str) -> SurfaceMap:
     sag = waves * wavelength
     check_heights(sag)
     return SurfaceMap(sag, wavelength, pitch, suffix, instrument="4Sight")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.errors import CodedError, ErrorCode
 
 #: Counts of this value and above mean "no data" (MetroPro reference, phase data matrix).
@@ -95,7 +95,7 @@ class SurfaceMap:
         return hashlib.sha256(self.content).hexdigest() if self.content else ""
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Bools:
         """(height, width), True where there is data."""
         return np.isfinite(self.sag)
 

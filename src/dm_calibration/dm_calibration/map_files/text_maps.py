@@ -19,6 +19,7 @@ from dm_calibration.map_files.surface_map import (
     sag_per_count,
     zygo_map,
 )
+from dm_common import Floats
 
 ASC_TITLE = b"Zygo ASCII Data File"
 XYZ_TITLE = b"Zygo XYZ Data File"
@@ -164,7 +165,7 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
     return zygo_map(sag, header, "xyz", f"system type {header['system_type']}")
 
 
-def _grid_indices(position: NDArray[np.float64], origin: int, size: int, name: str) -> NDArray[np.intp]:
+def _grid_indices(position: Floats, origin: int, size: int, name: str) -> NDArray[np.intp]:
     """Map indices from column or row numbers, which are counted from the corner of the camera or of the map."""
     first, last = position.min(), position.max()
     for start in (origin, 0):

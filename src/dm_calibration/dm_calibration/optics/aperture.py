@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dm_common import Bools, Floats, Ints
 from dm_common.errors import CodedError, ErrorCode
 
 #: Largest scatter of the rim about the fitted circle, relative to its radius, for which the region counts as a disc.
@@ -48,13 +49,13 @@ class Aperture:
     centre_y_px: float
     radius_px: float
 
-    def disc(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    def disc(self, shape: tuple[int, int]) -> Bools:
         """(height, width): True for pixels whose centre lies inside or on the circle."""
         x = np.arange(shape[1]) - self.centre_x_px
         y = np.arange(shape[0]) - self.centre_y_px
         return x**2 <= self.radius_px**2 - y[:, None] ** 2
 
-    def places(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    def places(self, rows: Ints, columns: Ints) -> NDArray[np.complex128]:
         """x + iy of pixels relative to the centre, y up, in units of the radius."""
         return np.asarray((columns - self.centre_x_px + 1j * (self.centre_y_px - rows)) / self.radius_px)
 
@@ -79,7 +80,7 @@ def configured_aperture(
     )
 
 
-def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
+def find_aperture(valid: Bools) -> Aperture:
     """Find the aperture that the valid pixels fill.
 
     The largest connected region of valid pixels, with its holes filled, is taken as the mirror. A circle is fitted to
@@ -115,7 +116,7 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
     return circle
 
 
-def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _filled_largest_region(valid: Bools) -> Bools:
     labels, count = ndimage.label(valid)
     if count == 0:
         raise InsufficientDataError("the map has no valid pixel, so no aperture can be found")
@@ -130,7 +131,7 @@ def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return gaps[1:-1, 1:-1] != gaps[0, 0]
 
 
-def _rim(region: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rim(region: Bools) -> tuple[Floats, Floats]:
     """Points halfway between a pixel of the region and a neighbour outside it, in pixels."""
     row_x, column_x = np.nonzero(region[:, 1:] != region[:, :-1])
     row_y, column_y = np.nonzero(region[1:] != region[:-1])
@@ -140,7 +141,7 @@ def _rim(region: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.flo
     )
 
 
-def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Aperture, float]:
+def _fit_circle(x: Floats, y: Floats) -> tuple[Aperture, float]:
     """Robust circle through points, and the scatter of the points about it (median absolute distance, pixels)."""
     from scipy import optimize  # imported here: a node with a configured aperture starts without it
 
@@ -159,7 +160,7 @@ def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Apertur
     return circle, float(np.median(distance))
 
 
-def _inscribed_circle(region: NDArray[np.bool_]) -> Aperture:
+def _inscribed_circle(region: Bools) -> Aperture:
     distance = ndimage.distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
     radius = distance.max()
     # In a rectangle all centres on a line are equally good: take the middle of the line.

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.values import live_parameter, real, switch
 
 #: Deviation from a multiple of 90 degrees that is ignored: it moves no pixel of any camera by a tenth [degrees].
@@ -28,7 +28,7 @@ class Orientation:
         "Rotate the flipped picture counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
     )
 
-    def apply(self, sag: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, sag: Floats) -> Floats:
         """Return the map in the mirror frame, C-contiguous.
 
         The centre is preserved. Except for half turns a rotated map has another (height, width), so that no data are

@@ -11,7 +11,6 @@ frames (:func:`~dm_calibration.influence.regression.drift_columns`).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from dm_calibration.hysteresis.features import play_features
@@ -19,7 +18,7 @@ from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run, without
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import complete_sag, drift_columns
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 #: Half-widths of the play operators beside the signal itself, normalised.
@@ -64,7 +63,7 @@ class RunHistory:
         self._plays = run.along(lambda signals: play_features(signals, self._radius, 1, maps.rest))
         self._crept = run.crept(self._plays)
 
-    def fit(self, keep: NDArray[np.bool_]) -> SagModel:
+    def fit(self, keep: Bools) -> SagModel:
         """The model that explains the maps in `keep` (M,) best."""
         keep = keep & self._usable
         area = np.sqrt(self._maps.points.weight)
@@ -95,7 +94,7 @@ class RunHistory:
         """(M, N) effective signals of the run."""
         return np.asarray(weights @ self._plays + rate * (weights @ self._crept))
 
-    def predict(self, keep: NDArray[np.bool_]) -> Floats:
+    def predict(self, keep: Bools) -> Floats:
         """(M, P) m: sag of every command of the run, by the model that explains the maps in `keep` (M,) best."""
         model = self.fit(keep)
         effective = self._effective(model.hysteresis.play_weight[:, 0], model.hysteresis.creep_rate)

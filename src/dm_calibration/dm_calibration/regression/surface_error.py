@@ -31,7 +31,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
@@ -40,7 +39,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
 from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions, StepwiseFit, leave_one_out, stepwise
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sample_regions import regional_rms
 
@@ -52,7 +51,7 @@ FOLDS = 10
 MODEL = "model"
 
 #: Sag of all commands of a run, (M, P) m, from the maps that it may see, (M,).
-Prediction = Callable[[NDArray[np.bool_]], Floats]
+Prediction = Callable[[Bools], Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +65,7 @@ class SurfaceErrors:
         regional: (S, R) m, rms surface control error inside concentric regions, the whole aperture last.
     """
 
-    rows: NDArray[np.int64]
+    rows: Ints
     labels: tuple[str, ...]
     signals: Floats
     regional: Floats
