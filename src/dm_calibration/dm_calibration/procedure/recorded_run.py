@@ -5,7 +5,7 @@ feedback. Independent of ROS.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -57,25 +57,15 @@ class RecordedRun:
 
 
 class RecordedBench:
-    """Replays a recorded bench; implements :class:`dm_common.measurement.Bench`."""
+    """Replays a recorded bench, whose moves are those of the plan; implements :class:`dm_common.measurement.Bench`."""
 
     def __init__(self, run: RecordedRun) -> None:
-        self._moves, self._maps = run.moves, run.maps
-        self._next_move = 0
-        self._window = (0, 0)
-        self._taken = 0
+        self._left, self._maps = list(run.moves), run.maps
+        self._found: Iterator[Measurement] = iter(())
 
     def degauss(self) -> None:
-        """Skip to the next degauss.
-
-        Raises:
-            RecordingError: there is none.
-        """
-        for index in range(self._next_move, len(self._moves)):
-            if self._moves[index].degauss:
-                self._next_move = index + 1
-                return
-        raise RecordingError("the recording ends before a degauss of the run")
+        """Go on to the next move, which is the degauss."""
+        self._left.pop(0)
 
     def apply(self, signals: Floats) -> Floats:
         """The signals that were written when `signals` were commanded.
@@ -83,18 +73,16 @@ class RecordedBench:
         Raises:
             RecordingError: `signals` were not commanded.
         """
-        for index in range(self._next_move, len(self._moves)):
-            move = self._moves[index]
-            if not move.degauss and np.array_equal(move.requested, signals):
-                self._next_move = index + 1
-                later = self._moves[index + 1 :]
-                self._window = (move.stamp_ns, later[0].stamp_ns if later else np.iinfo(np.int64).max)
-                self._taken = 0
-                return move.applied
-        raise RecordingError(
-            f"a command of the run is not among the {len(self._moves) - self._next_move} recorded moves left: "
-            "the recording began late, ended early, or lost messages"
-        )
+        if not self._left or not np.array_equal(self._left[0].requested, signals):
+            raise RecordingError(
+                f"a command of the run is not among the {len(self._left)} recorded moves left: "
+                "the recording began late, ended early, or lost messages"
+            )
+        move = self._left.pop(0)
+        end = self._left[0].stamp_ns if self._left else np.iinfo(np.int64).max
+        found = [one for one in self._maps if move.stamp_ns <= one.stamp_ns < end]
+        self._found = iter([replace(one, moved_ns=move.stamp_ns) for one in found])
+        return move.applied
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         """Return at once: there is nothing to wait for."""
@@ -106,12 +94,9 @@ class RecordedBench:
         Raises:
             MeasurementError: there is none, for example because it was dropped in the live run.
         """
-        begin, end = self._window
-        found = [measured for measured in self._maps if begin <= measured.stamp_ns < end]
-        if self._taken >= len(found):
+        if (measured := next(self._found, None)) is None:
             raise MeasurementError(ErrorCode.MAP_REJECTED, "no further map was recorded in this state")
-        self._taken += 1
-        return replace(found[self._taken - 1], moved_ns=begin)
+        return measured
 
 
 def plan_text(plan: PlanKind, options: PlanOptions, maps_per_state: int) -> str:
