@@ -5,14 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.map_files.surface_map import (
-    MapFileError,
-    SurfaceMap,
-    check_size,
-    sag_from_counts,
-    sag_per_count,
-    zygo_map,
-)
+from dm_calibration.map_files.surface_map import MapFileError, SurfaceMap, check_size, sag_from_counts, zygo_map
 
 #: magic: (format, header size in bytes)
 HEADERS = {0x881B036F: (1, 834), 0x881B0370: (2, 834), 0x881B0371: (3, 4096)}
@@ -121,6 +114,6 @@ def parse_dat(content: bytes) -> SurfaceMap:
     offset = check_length(header, len(content))
     width, height = header["width"], header["height"]
     counts = np.frombuffer(content, ">i4", width * height, offset).reshape(height, width)
-    sag = sag_from_counts(counts, sag_per_count(header))
+    sag = sag_from_counts(counts, header)
     software = _SOFTWARE.get(header["software"], f"software {header['software']}")
     return zygo_map(sag, header, "dat", f"{software}, system type {header['system_type']}")

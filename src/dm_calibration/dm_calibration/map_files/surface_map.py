@@ -162,13 +162,15 @@ def check_heights(sag: Floats) -> None:
         raise _outside("height", f"{lowest:g} to {highest:g} m", f"-{HEIGHT_MAX:g} to {HEIGHT_MAX:g} m")
 
 
-def sag_per_count(header: Mapping[str, Any]) -> float:
-    """Return m of surface sag per count from the header of a ZYGO file: S O W / R, negative if the data are inverted.
+def sag_from_counts(counts: NDArray[np.integer], header: Mapping[str, Any]) -> Floats:
+    """Return sag [m] of the same shape from the counts of a ZYGO file, NaN where they say "no data".
 
-    The interferometric scale factor S already turns double-pass fringes into surface height.
+    A count is S O W / R, negative if the data are inverted. The interferometric scale factor S already turns
+    double-pass fringes into surface height.
 
     Raises:
         MapFileError: a factor that makes heights meaningless (0, NaN, absurd) or a code of unknown meaning.
+        NoValidPixelsError: every pixel is invalid.
     """
     scale_factor = check_factor("interferometric scale factor", header["scale_factor"])
     obliquity = check_factor("obliquity factor", header["obliquity"])
@@ -178,7 +180,13 @@ def sag_per_count(header: Mapping[str, Any]) -> float:
     if header["data_sign"] not in (0, 1):
         raise _outside("data sign", header["data_sign"], "0 (normal) or 1 (inverted)")
     sign = -1.0 if header["data_sign"] == 1 else 1.0
-    return sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[header["phase_resolution"]]
+    metres_per_count = sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[header["phase_resolution"]]
+    invalid = counts >= INVALID_COUNTS
+    if invalid.all():
+        raise _no_valid_pixels(counts.shape)
+    sag = np.asarray(counts * metres_per_count, dtype=np.float64)
+    sag[invalid] = math.nan
+    return sag
 
 
 def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str) -> SurfaceMap:
@@ -194,20 +202,6 @@ def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str)
         time_stamp=float(header["time_stamp"]) if header["time_stamp"] > 0 else None,
         system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
     )
-
-
-def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> Floats:
-    """Return sag [m] of the same shape, NaN where the counts say "no data".
-
-    Raises:
-        NoValidPixelsError: every pixel is invalid.
-    """
-    invalid = counts >= INVALID_COUNTS
-    if invalid.all():
-        raise _no_valid_pixels(counts.shape)
-    sag = np.asarray(counts * metres_per_count, dtype=np.float64)
-    sag[invalid] = math.nan
-    return sag
 
 
 def _no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:

@@ -16,7 +16,6 @@ from dm_calibration.map_files.surface_map import (
     check_size,
     check_wavelength,
     sag_from_counts,
-    sag_per_count,
     zygo_map,
 )
 from dm_common import Floats
@@ -116,10 +115,9 @@ def parse_asc(content: bytes) -> SurfaceMap:
     """Parse a whole `.asc` file ("Zygo ASCII Data File - Format 2"). Raises MapFileError as :func:`parse_xyz`."""
     header, body = read_header(content)
     pixels = check_size(header["width"], header["height"])
-    metres_per_count = sag_per_count(header)
     intensities = header["intensity_width"] * header["intensity_height"] * header["intensity_buckets"]
     counts = numbers(_phase_section(intensities, body), "phase data", pixels, np.int64)
-    sag = sag_from_counts(counts.reshape(header["height"], header["width"]), metres_per_count)
+    sag = sag_from_counts(counts.reshape(header["height"], header["width"]), header)
     return zygo_map(sag, header, "asc", f"system type {header['system_type']}")
 
 
