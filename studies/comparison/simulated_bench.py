@@ -16,7 +16,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.surfaces import LinearModel
-from dm_calibration.optics.aperture import Aperture, configured_aperture
+from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
@@ -203,7 +203,7 @@ class SimulatedBench:
     def aperture(self) -> Aperture:
         """The working aperture on the maps."""
         pixels = self.config.pixels
-        return configured_aperture((pixels, pixels), self.pitch, self.mirror.working_radius)
+        return Aperture.configured((pixels, pixels), self.pitch, self.mirror.working_radius)
 
     def measurement_of(self, sag: Floats) -> Measurement:
         """Fit and sample a map: the same steps as `dm_calibration.acquisition.ingest.Ingest`, without a file."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
+from dm_calibration.optics.aperture import Aperture, InsufficientDataError, find_aperture
 
 
 def disc(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_no_valid_pixel_is_refused() -> None:
 
 
 def test_configured_aperture_counts_from_the_maps_centre() -> None:
-    found = configured_aperture((101, 201), 1e-4, 3e-3, centre_x=1e-3, centre_y=2e-3)
+    found = Aperture.configured((101, 201), 1e-4, 3e-3, centre_x=1e-3, centre_y=2e-3)
     assert (found.centre_x_px, found.centre_y_px, found.radius_px) == pytest.approx((110, 30, 30))
 
 

@@ -8,13 +8,7 @@ import numpy as np
 
 from dm_calibration.acquisition.reference_surface import difference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
-from dm_calibration.optics.aperture import (
-    Aperture,
-    InsufficientDataError,
-    MapRejectedError,
-    configured_aperture,
-    find_aperture,
-)
+from dm_calibration.optics.aperture import Aperture, InsufficientDataError, MapRejectedError, find_aperture
 from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
@@ -240,7 +234,7 @@ class Ingest:
                 f"aperture.radius = {settings.aperture_radius:g} m, but the file does not tell its lateral resolution: "
                 "set the parameter pitch, or aperture.radius to 0"
             )
-        wanted = configured_aperture(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
+        wanted = Aperture.configured(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
         if not settings.aperture_follow:
             return wanted, nothing
         seen = find_aperture(valid)

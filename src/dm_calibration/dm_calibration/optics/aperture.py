@@ -1,5 +1,7 @@
 """The circular aperture on a map: found from the valid pixels, or configured."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 
@@ -49,6 +51,13 @@ class Aperture:
     centre_y_px: float
     radius_px: float
 
+    @classmethod
+    def configured(
+        cls, shape: tuple[int, int], pitch: float, radius: float, centre_x: float = 0.0, centre_y: float = 0.0
+    ) -> Aperture:
+        """Aperture from lengths in m: radius, and centre from the centre of the map of this shape (x right, y up)."""
+        return cls((shape[1] - 1) / 2 + centre_x / pitch, (shape[0] - 1) / 2 - centre_y / pitch, radius / pitch)
+
     def disc(self, shape: tuple[int, int]) -> Bools:
         """(height, width): True for pixels whose centre lies inside or on the circle."""
         x = np.arange(shape[1]) - self.centre_x_px
@@ -67,17 +76,6 @@ class Aperture:
         half = np.sqrt(np.maximum(self.radius_px**2 - (rows - self.centre_y_px) ** 2, 0))
         columns = np.floor(self.centre_x_px + half) - np.ceil(self.centre_x_px - half) + 1
         return int(columns.sum())
-
-
-def configured_aperture(
-    shape: tuple[int, int], pitch: float, radius: float, centre_x: float = 0.0, centre_y: float = 0.0
-) -> Aperture:
-    """Aperture from lengths in m: radius, and centre from the map's centre (x right, y up)."""
-    return Aperture(
-        (shape[1] - 1) / 2 + centre_x / pitch,
-        (shape[0] - 1) / 2 - centre_y / pitch,
-        radius / pitch,
-    )
 
 
 def find_aperture(valid: Bools) -> Aperture:
