@@ -120,9 +120,8 @@ def planned(text: str, mirror: Mirror) -> tuple[Plan, int]:
         ) from error
 
 
-def _difference(plan: Plan, moves: Sequence[Move]) -> str:
-    """Where `moves` differ from those of `plan`; "" = nowhere. Solved steps match any move."""
-    end = _end(plan, moves)
+def _difference(plan: Plan, moves: Sequence[Move], end: int) -> str:
+    """Where `moves` differ from those of `plan` before the step `end`; "" = nowhere. Solved steps match any move."""
     for step, move in zip(plan.steps[:end], moves, strict=False):
         if step.kind is StepKind.DEGAUSS:
             if not move.degauss:
@@ -132,11 +131,10 @@ def _difference(plan: Plan, moves: Sequence[Move]) -> str:
     return f"step {plan.steps[len(moves)].label!r}: the recording ends before it" if len(moves) < end else ""
 
 
-def _end(plan: Plan, moves: Sequence[Move]) -> int:
-    """The step before which the run ended: a run that was accurate enough there ended with a move back to rest."""
+def _end(plan: Plan, moves: Sequence[Move], rest: Floats) -> int:
+    """The step before which the run ended: a run that was accurate enough there ended with a move back to `rest`."""
     last = len(moves) - 1
-    rest = next((step.signals for step in plan.steps if step.kind is StepKind.REFERENCE), None)
-    ended = last in plan.ends and rest is not None and np.array_equal(moves[last].requested, rest)
+    ended = last in plan.ends and np.array_equal(moves[last].requested, rest)
     return last if ended else len(plan.steps)
 
 
@@ -148,11 +146,11 @@ def repeat_run(run: RecordedRun, options: ProcedureOptions | None = None) -> tup
         Refusal: as in the live run, if several states in a row gave no map.
     """
     plan, count = planned(run.plan, run.mirror)
-    if reason := _difference(plan, run.moves):
+    end = _end(plan, run.moves, run.mirror.rest)
+    if reason := _difference(plan, run.moves, end):
         raise RecordingError(reason)
     # As in the live run, a full plan solves its shapes with its own pokes.
     model = run.model if plan.kind is PlanKind.SURFACES else None
-    end = _end(plan, run.moves)
 
     def enough(outcome: Outcome) -> bool:
         return outcome.records[-1].step + 1 >= end
