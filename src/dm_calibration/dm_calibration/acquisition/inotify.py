@@ -32,11 +32,13 @@ class ClosedFiles:
 
     def wait(self, seconds: float) -> list[str]:
         """Names as soon as at least one is reported; empty after `seconds`."""
-        if not self._watching and time.monotonic() >= self._tried + RETRY_S:
-            self._watch()
         if self._descriptor < 0:
             time.sleep(max(seconds, 0.0))
             return []
+        if not self._watching and time.monotonic() >= self._tried + RETRY_S:
+            self._tried = time.monotonic()
+            mask, path = _CLOSE_WRITE | _MOVED_TO | _ONLYDIR, os.fsencode(self._folder)
+            self._watching = self._library.inotify_add_watch(self._descriptor, path, mask) >= 0
         if not select.select([self._descriptor], [], [], max(seconds, 0.0))[0]:
             return []
         content, names, at = os.read(self._descriptor, _BUFFER), [], 0
@@ -54,10 +56,3 @@ class ClosedFiles:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
-
-    def _watch(self) -> None:
-        self._tried = time.monotonic()
-        if self._descriptor >= 0:
-            mask = _CLOSE_WRITE | _MOVED_TO | _ONLYDIR
-            path = os.fsencode(self._folder)
-            self._watching = self._library.inotify_add_watch(self._descriptor, path, mask) >= 0

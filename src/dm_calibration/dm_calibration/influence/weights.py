@@ -23,14 +23,12 @@ favour the centre ten to one.
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dm_calibration.influence.regression import RANK_TOLERANCE
 from dm_common import Floats
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import point_weights
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import TERMS, basis
-
-#: Smallest singular value, relative to the largest, at which a least-squares problem still counts as determined.
-RANK_TOLERANCE = 1e-7
 
 
 def region_weights(variance: ArrayLike, epsilon: float) -> Floats:

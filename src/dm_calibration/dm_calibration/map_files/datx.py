@@ -84,7 +84,6 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     check_heights(sag)
 
     software = " ".join(filter(None, (_extra_text(extra, "Software Info Name"), _extra_text(extra, "System Type"))))
-    time_stamp = _extra_number(extra, "Time Stamp")
     return SurfaceMap(
         sag=sag,
         wavelength=wavelength,
@@ -93,7 +92,7 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
         origin=_origin(surface),
         instrument=software or "Mx",
         serial=_extra_text(extra, "System Serial Number"),
-        time_stamp=time_stamp if time_stamp else None,
+        time_stamp=_extra_number(extra, "Time Stamp") or None,
         system_error_subtracted=_TRUTH.get(_extra_text(extra, "Subtract System Error").lower()),
     )
 

@@ -78,11 +78,11 @@ def forecast(
     measured = np.array([step.takes_map for step in plan.steps], dtype=bool)
     time = np.cumsum(step_times(plan.steps, settle_time, map_time))[measured]
     duration = float(time[-1]) if len(time) else 0.0
+    expected = Forecast(duration, 0.0)
     tested = any(step.kind is StepKind.CHECK for step in plan.steps)
     if not tested or (earlier is None and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
-        return Forecast(duration, 0.0)
+        return expected
     law = left_of_one_map(earlier, mirror)
-    expected = Forecast(duration, 0.0)
     for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):
         expected = Forecast(float(time[part - 1]), float(law / np.sqrt(part)), part)
         if expected.max_zernike <= until:

@@ -30,9 +30,8 @@ class Entry:
 
 def new_id(mirror_name: str, serial: str, created_ns: int) -> str:
     """An id made from mirror, serial number and time (UTC)."""
-    parts = [_stem(part) for part in (mirror_name, serial)]
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
-    return "_".join([part for part in parts if part] + [stamp])
+    return "_".join(filter(None, (_stem(mirror_name), _stem(serial), stamp)))
 
 
 def _stem(text: str) -> str:
