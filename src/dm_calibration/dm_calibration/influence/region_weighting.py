@@ -84,8 +84,6 @@ def choose_weighting(
 ) -> RegionWeighting:
     """Region weights of `maps` with epsilon by k-fold cross-validation, or with a given one.
 
-    Folds go by commanded state in order, so that they are the same in every run and repeated maps stay together.
-
     Args:
         design: of these maps, (M, p).
         sag: (M, P) m, without gaps, piston and tilt removed.

@@ -25,8 +25,7 @@ from dm_common.errors import CodedError, ErrorCode
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 
-#: Methods by the name used in messages and calibration files; AZWreg fits the Zernike coefficients anew to the sag with
-#: region weights, Eq. (8).
+#: Methods by the name used in messages and calibration files.
 METHODS = ("AZreg", "AZWreg")
 #: Least range of applied signals over the maps, normalised, for an actuator to count as excited: that of the smallest
 #: pokes (a half-swing of 0.01), which converters round.

@@ -78,9 +78,7 @@ class ErrorPredictor:
 def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptions | None = None) -> ErrorPredictor:
     """A predictor from all surfaces p01-p58 of a calibration; its held-out error is the leave-one-out one.
 
-    Raises:
-        As :func:`~dm_calibration.regression.surface_error.surface_errors` and
-        :func:`~dm_calibration.regression.surface_error.regress`.
+    Raises as `surface_errors` and `regress` of :mod:`~dm_calibration.regression.surface_error`.
     """
     errors = surface_errors(maps, influence)
     history = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T)

@@ -142,10 +142,9 @@ def leave_one_out(
     weights: ArrayLike | None = None,
     options: SelectionOptions | None = None,
 ) -> Floats:
-    """(n,) response of each sample predicted by a model selected and fitted without it. Arguments and errors as above.
+    """(n,) response of each sample predicted by a model selected and fitted without it.
 
-    Raises:
-        TooFewMapsError: as :func:`stepwise`, for one sample fewer.
+    Arguments and errors as :func:`stepwise`, for one sample fewer.
     """
     options = options or SelectionOptions()
     x, y, w = _samples(candidates, response, weights, 1)

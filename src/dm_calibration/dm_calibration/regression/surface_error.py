@@ -22,9 +22,6 @@ regions of all surfaces as samples of one regression. Table 3 gives Err and RelE
 the same for both models to within rounding: that excludes (b). n = 49 in Table 2 excludes (d). Chosen is (a) with (c):
 the influence function carries its method, :func:`surface_weights` gives the weights, and Eq. (8) does what the text
 says, "make a larger value of variability have less impact". epsilon is the median of the r.
-
-p values and R^2 are optimistic, because the variables were selected on the same data (see
-:mod:`~dm_calibration.regression.stepwise`); held-out errors stand beside them.
 """
 
 from collections.abc import Callable, Sequence
