@@ -15,7 +15,6 @@ from dm_calibration.map_files.surface_map import (
     check_pitch,
     check_wavelength,
 )
-from dm_common import Floats
 
 #: The groups by which files are recognised: of version 2 (.h5), and of newer ones (.4D).
 _OLD, _NEW = "measurement0", "Measurement"
@@ -35,25 +34,17 @@ def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
     Raises:
         MapFileError: not a complete, meaningful map; the message names what is missing or wrong.
     """
-    if _OLD not in file:
-        return _newer(file, content)
-    group, surface = (object_at(file, path) for path in (f"{_OLD}/genraw", f"{_OLD}/genraw/data"))
-    wavelength = check_wavelength(_length(group, "wavelength"))
-    pitch = check_pitch(_length(group, "xpix")) if "xpix" in group.attrs else None
-    return _surface_map(read_heights(surface, content, _NO_DATA), wavelength, pitch, "h5")
-
-
-def _newer(file: h5py.File, content: bytes) -> SurfaceMap:
-    group = object_at(file, _NEW)
-    if (count := number_in(group, _COUNT)) is not None:
-        raise MapFileError(f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, without it")
-    wavelength = check_wavelength(1e-9 * required(group, _WAVELENGTH))
-    surface = object_at(file, f"{_NEW}/SurfaceInWaves/Data")
-    return _surface_map(read_heights(surface, content, np.nan), wavelength, None, "4D")
-
-
-def _surface_map(waves: Floats, wavelength: float, pitch: float | None, suffix: str) -> SurfaceMap:
-    sag = waves * wavelength
+    if _OLD in file:
+        group, surface = (object_at(file, path) for path in (f"{_OLD}/genraw", f"{_OLD}/genraw/data"))
+        wavelength, no_data, suffix = _length(group, "wavelength"), _NO_DATA, "h5"
+        pitch = check_pitch(_length(group, "xpix")) if "xpix" in group.attrs else None
+    else:
+        group = object_at(file, _NEW)
+        if (count := number_in(group, _COUNT)) is not None:
+            raise MapFileError(f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, without it")
+        surface = object_at(file, f"{_NEW}/SurfaceInWaves/Data")
+        wavelength, no_data, suffix, pitch = 1e-9 * required(group, _WAVELENGTH), np.nan, "4D", None
+    sag = check_wavelength(wavelength) * read_heights(surface, content, no_data)
     check_heights(sag)
     return SurfaceMap(sag, wavelength, pitch, suffix, instrument="4Sight")
 
