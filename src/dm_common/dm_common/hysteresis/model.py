@@ -200,12 +200,11 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`, with creep fully settled there."""
         play = np.full((actuators, len(self.play_radius)), middle)
         fading = np.zeros((actuators, self.fading.size if self.fading is not None else 0))
-        none, crept = np.zeros(actuators), np.zeros((actuators, len(self.creep_time)))
+        position, elements = self._position(play, fading), len(self.creep_time)
+        crept = np.repeat(position[:, None], elements, axis=1)
         lagged = np.full((actuators, len(self.lag_time)), middle)
         signals = np.full(actuators, middle)
-        state = HysteresisState(time, signals, play, fading, none, crept, crept.sum(axis=0), lagged)
-        position = self._position(play, state.fading)
-        return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
+        return HysteresisState(time, signals, play, fading, position, crept, np.zeros(elements), lagged)
 
     def degaussed(self, state: HysteresisState, time: float, middle: float = 0.0) -> HysteresisState:
         """The state after a degauss that ended at `middle`; creep still remembers what was before."""
