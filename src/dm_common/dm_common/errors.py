@@ -67,7 +67,6 @@ class Refusal(CodedError):
     """A request that is not carried out.
 
     Attributes:
-        error_code: a value of ErrorCode.
         actuators: (N,) bool, True for the actuators at fault; None when it is not about single actuators.
     """
 

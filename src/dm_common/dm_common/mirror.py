@@ -64,10 +64,8 @@ def mismatch(
 ) -> str:
     """Why a calibration does not belong to `mirror`, as a sentence; "" = it does.
 
-    Args:
-        mirror: as the driver describes it.
-        serial, actuators, aperture_radius: of the mirror that was calibrated, the last in m.
-        tolerance: largest relative difference of the two aperture radii.
+    `serial`, `actuators` and `aperture_radius` (m) are those of the mirror that was calibrated; `tolerance` is the
+    largest relative difference of the two aperture radii.
     """
     if serial != mirror.serial:
         return f"measured on mirror serial {serial!r}, this is {mirror.serial!r}"

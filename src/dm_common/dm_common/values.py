@@ -160,11 +160,7 @@ def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **ot
 
 
 class Fields:
-    """Checks of all fields of a request or goal, by a table.
-
-    Args:
-        table: {name: allowed values}; dots lead into nested messages.
-    """
+    """Checks of all fields of a request or goal, by a table {name: allowed values}; dots lead into nested messages."""
 
     def __init__(self, table: Mapping[str, Value]) -> None:
         self._rules = [(name, attrgetter(name), value) for name, value in table.items()]

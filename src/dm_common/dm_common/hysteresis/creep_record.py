@@ -146,12 +146,8 @@ class CreepRecorder:
     """Keeps the record of the mirror that an observer follows.
 
     Args:
-        folder: of the records; empty = nothing is kept.
-        observer: of the mirror.
+        folder: of the records; may change; empty = nothing is kept.
         warn: called, from any thread, with a message on what failed.
-
-    Attributes:
-        folder: as above; may change.
     """
 
     def __init__(self, folder: str, observer: HysteresisObserver, warn: Callable[[str], None]) -> None:

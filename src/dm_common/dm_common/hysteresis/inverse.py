@@ -210,8 +210,6 @@ class ConstrainedInverse:
     """Finds the nearest commands inside the limits of one mirror.
 
     Args:
-        law: of its actuators.
-        limits: of the signals.
         matrix: (M, N) response per unit of each effective signal, in the rows that are to be met.
         ridge: weight of the squared effective signals, in the squared unit of `matrix`.
     """

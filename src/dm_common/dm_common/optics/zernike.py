@@ -124,20 +124,15 @@ def basis(x: ArrayLike, y: ArrayLike) -> Floats:
 
 
 def curvature_of_defocus(coefficient: float, radius: float) -> float:
-    """Curvature c (1/m, positive = concave) of the paraboloid c r^2 / 2 that has this defocus over an aperture.
-
-    Args:
-        coefficient: of the defocus, m.
-        radius: of the aperture, m.
+    """Curvature c (1/m, positive = concave) of the paraboloid c r^2 / 2 that has a defocus of `coefficient` (m) over an
+    aperture of `radius` (m).
     """
     return 4.0 * coefficient / radius**2
 
 
 def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
-    """Rms sag over the aperture without piston and tilt, m, of coefficients (21,), m.
-
-    Args:
-        residual: rms of what the terms do not describe, m.
+    """Rms sag over the aperture without piston and tilt, m, of coefficients (21,), m, and of a `residual` of this rms,
+    m, that the terms do not describe.
     """
     return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
 

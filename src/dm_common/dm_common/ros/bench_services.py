@@ -96,10 +96,7 @@ class BenchServices:
     def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
         """Hold the mirror for the block: commands of others are refused.
 
-        Args:
-            asked: the goal or request to do so; its `holder` and `take_over` are used, see `MirrorHolder.held`.
-            purpose: what it is for and how to end it, for clients that are refused meanwhile.
-            duration: expected duration, s; 0 = not known.
+        Arguments as those of `MirrorHolder.held`.
 
         Raises:
             Refusal: somebody else holds it, or there is no driver.
@@ -263,13 +260,7 @@ class BenchServices:
 
     @contextmanager
     def _answered(self, what: str, server: qos.Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
-        """Give a call a condition that ends its wait, and turn its failure into a code and a sentence.
-
-        Args:
-            what: name of what is called.
-            server: liveliness of the node that serves it.
-            ready: whether it is served.
-        """
+        """Give a call of `what` at `server` a condition that ends its wait, and turn its failure into a Refusal."""
         server.wait_for_return(self._stopping)
         gone = server.since_now(ready)
         try:

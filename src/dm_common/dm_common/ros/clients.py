@@ -46,9 +46,7 @@ def call(
     """Call a service from a worker thread and wait for the answer.
 
     Args:
-        client, request: the service, and what to send.
         timeout_s: longest wait for the server, and for its answer.
-        cancelled: ends the wait.
         again_s: an unanswered request is sent again after this time, once; only for one that may be carried out twice.
         send_by: called with a function that sends the request; returns what that function returns.
         ready_s: longest wait for the server, if shorter than `timeout_s`.
@@ -131,7 +129,6 @@ def run_goal(
     """Run a goal from a worker thread and return its result; if given up, cancel it first (Ctrl-C reports its end).
 
     Args:
-        client, goal: the action, and what to send.
         timeout_s: longest wait for the end.
         answer_s: longest wait for the server, and for its answer to the goal; None = `timeout_s`.
         on_feedback: called by the executor.
@@ -187,8 +184,6 @@ class MirrorHolder:
     A restarted driver receives the renewal too, so that the hold survives the restart.
 
     Args:
-        node: hosts the client.
-        name: of the holder.
         gone: whether the driver is known to be gone; the release of a hold is then not waited for.
 
     Attributes:

@@ -118,9 +118,7 @@ class Parameter:
 def parameters_of(prefix: str, config: Any) -> Iterator[Parameter]:
     """The parameters that fields of a dataclass declare by `dm_common.values.parameter`, in their order.
 
-    Args:
-        prefix: put before the names of the fields.
-        config: the dataclass, or an object of it whose values are the defaults.
+    `config` is the dataclass, or an object of it whose values are the defaults.
     """
     for each in fields(config):
         if each.metadata:

@@ -64,8 +64,6 @@ class Liveliness:
     A publisher without a lease is not seen at all: nothing is known of it.
 
     Args:
-        node: hosts the subscription.
-        name: of the node that is watched.
         message_type, topic: one that is published seldom.
         profile: of the topic, without the lease.
 
@@ -95,11 +93,7 @@ class Liveliness:
         self._heard_at = time.monotonic()
 
     def wait_for_return(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a node that is lost; `RETURN_S` at most.
-
-        Args:
-            stop: ends the wait.
-        """
+        """Wait for a node that is lost, until `stop()`; `RETURN_S` at most."""
         deadline = time.monotonic() + RETURN_S
         while self.lost:
             if stop() or time.monotonic() > deadline:
