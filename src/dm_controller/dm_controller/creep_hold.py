@@ -31,14 +31,10 @@ CONFIRM_S = 1.0
 
 
 class CreepHold:
-    """Keeps the shape that was commanded last.
-
-    Args:
-        values: parameters `hold.*`, live.
-        monitor: knows the order whose shape is held, and the driver's reports.
+    """Keeps the shape that was commanded last, of the order that `monitor` follows, by the live parameters `hold.*`.
 
     Attributes:
-        corrections: sent so far.
+        corrections: number sent so far.
         ended: the reason why the last hold ended.
     """
 

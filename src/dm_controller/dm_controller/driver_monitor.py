@@ -42,10 +42,7 @@ def _not_active(report: ActuatorState) -> Refusal:
 
 
 class DriverMonitor:
-    """Judges the driver by its reports. Steady times, s, are passed to each call.
-
-    Args:
-        values: parameters `driver_timeout` and `move_timeout`.
+    """Judges the driver by its reports, `driver_timeout` and `move_timeout`. Steady times, s, are passed to each call.
 
     Attributes:
         order: the order whose shape was commanded last; None = none was yet.

@@ -37,11 +37,7 @@ START_S = 3.0
 
 
 class FocusHost(ManagedNode, ABC):
-    """The services, actions and lifecycle of the node: only one thread at a time uses the controller.
-
-    Args:
-        on_change, keywords: see `ManagedNode`.
-    """
+    """The services, actions and lifecycle of the node: only one thread at a time uses the controller."""
 
     def __init__(self, on_change: Callable[[Mapping[str, Any]], None], **keywords: Any) -> None:
         super().__init__("focus_controller", PARAMETERS, on_change, **keywords)
@@ -142,12 +138,7 @@ class FocusHost(ManagedNode, ABC):
 
 
 class MoveFocusAction:
-    """Serves `move_focus` in worker threads; the newest goal pre-empts.
-
-    Args:
-        node: hosts the action and carries the requests out.
-        values: its parameters, live.
-    """
+    """Serves `move_focus` in worker threads; the newest goal pre-empts."""
 
     def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
         self._node, self._values = node, values
@@ -252,7 +243,6 @@ class DegaussClient:
     """Calls the driver's degauss, one at a time; no method waits.
 
     Args:
-        node: hosts the client.
         ended: called by the executor with the number of the run, its duration in s, and the refusal (None = done).
     """
 

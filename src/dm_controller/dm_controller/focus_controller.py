@@ -48,10 +48,6 @@ class FocusController:
     Attributes:
         active: the calibration in use; None = there is none.
         not_calibrated: the reason for that.
-        observer: follows the actuators.
-        monitor: follows the driver.
-        hold: corrects the present shape for creep.
-        conditioning: a degauss under way, and the order that waits for it.
         requests, refused: counts since the start.
         degauss_offered: returns whether the driver offers the action `degauss`.
     """

@@ -27,9 +27,7 @@ CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it 
 def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
     """The message on the outcome of an order, with the full prediction.
 
-    Args:
-        values: parameters of the node.
-        share: contribution of hysteresis where the calibration has no model of it; None = not known.
+    `share` is the contribution of hysteresis where the calibration has no model of it; None = not known.
     """
     request, move, active, refusal = order.request, order.move, order.active, order.refusal
     state = without_figures(FocusState()) if move is None else FocusState()
@@ -149,14 +147,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment, 
 def capabilities_message(
     controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now: Moment
 ) -> Capabilities:
-    """What the mirror can do now.
-
-    Args:
-        controller: of the mirror.
-        mirror: None = not known.
-        values: parameters of the node.
-        now: by this time it is judged whether the driver still reports.
-    """
+    """What the mirror can do `now`, by which it is judged whether the driver still reports."""
     active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
     message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)
     message.header.stamp = time_message(now.ns)

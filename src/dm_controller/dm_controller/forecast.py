@@ -80,7 +80,6 @@ class ForecastClient:
         later call asks again.
 
         Args:
-            active: the calibration in use; None = none.
             tolerance: m, largest coefficient error at which a curvature counts as reachable.
         """
         if active is not None and active.planner.hysteresis is not None:

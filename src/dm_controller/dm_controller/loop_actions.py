@@ -43,12 +43,8 @@ def loop_times(values: Mapping[str, Any]) -> Mapping[str, Any]:
 class LoopBench(BenchServices):
     """Driver and interferometer for one goal of either action at a time, with what the focus controller knows.
 
-    Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
-
     Attributes:
-        parameters: as given.
+        parameters: of `node`, LOOP_PARAMETERS among them.
     """
 
     def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
@@ -74,7 +70,6 @@ class LoopBench(BenchServices):
 
         Args:
             asked: the goal or request, which names the client, see `BenchServices.held`.
-            body: carries the goal out.
             needed: a node that the goal needs besides driver and interferometer.
             history: whether a map is valid only if the driver has known the actuators' history since the degauss.
         """
@@ -159,12 +154,7 @@ class LoopBench(BenchServices):
 
 
 def serve_loops(node: FocusHost, values: Mapping[str, Any]) -> None:
-    """Offer both actions, one goal at a time. Their code is loaded with the first goal: most mirrors never need it.
-
-    Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
-    """
+    """Offer both actions, one goal at a time. Their code is loaded with the first goal: most mirrors never need it."""
     bench = LoopBench(node, values)
     store = node.create_client(StoreRecipes, "store_recipes")
     calibration = qos.watch(node, "calibration", Calibration, "calibration", qos.LATCHED)

@@ -26,11 +26,7 @@ def mean_of(shapes: Sequence[Shape]) -> Shape:
 
 
 class Defects:
-    """The defects found in the rounds of one run.
-
-    Args:
-        model: the model that has the defect.
-    """
+    """The defects of `model` found in the rounds of one run."""
 
     def __init__(self, model: InfluenceModel) -> None:
         self._none = Shape(np.zeros_like(model.zernike_offset), np.zeros_like(model.sag_offset))

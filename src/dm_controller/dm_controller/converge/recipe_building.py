@@ -90,14 +90,11 @@ class RecipeBuilder:
 
     Args:
         loop: plans moves; without a hysteresis model its effective signals are signals.
-        plant: the bench.
         now: the plant's time, s, of the clock that maps are stamped with.
-        state: what the mirror remembers so far, mainly creep; None = demagnetised and long at rest at mid range.
-        on_step: called after each map.
-        cancelled: called before each map.
+        state: what the mirror remembers, mainly creep; kept up to date; None = demagnetised, long at mid range.
+        on_step: called after each map; `cancelled` before each.
 
     Attributes:
-        state: what the mirror remembers now.
         maps: taken altogether.
     """
 

@@ -38,9 +38,7 @@ class RecipeRun:
     """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
-        bench: knows the calibration in use and the actuators' hysteresis; REACHABLE_TOLERANCE is among its parameters.
-        store: client of the service `store_recipes`.
-        calibration: liveliness of the node that serves it.
+        store: client of the service `store_recipes`, which the node `calibration` serves.
     """
 
     def __init__(self, bench: LoopBench, store: Client, calibration: Liveliness) -> None:

@@ -108,10 +108,6 @@ class PreparedInverse:
     Args:
         law: one whose effective signals depend on the past.
         state: of a mirror at rest.
-        limits: of the signals.
-
-    Attributes:
-        state: as given.
     """
 
     def __init__(self, law: HysteresisModel, state: HysteresisState, limits: Limits) -> None:
@@ -147,8 +143,7 @@ class PreparedInverse:
     def _cubics(self, parts: Pieces, begin: Floats, first: Floats, steeper: Floats, waiting: Floats) -> Floats:
         """Rows of: onset, value there, and coefficients 1 to 3 of the inverse from there; NaN where it is not exact.
 
-        Args:
-            begin, first, steeper, waiting: as `Pieces.onsets` returns them.
+        The arguments are what `Pieces.onsets` returns.
         """
         ends, curve = np.array([[self._low], [self._high]]), parts.polynomial
         # A piece ends where the next one begins, the last one at the limit.

@@ -158,13 +158,10 @@ class CalibratedMirror:
     saturates). A small ridge keeps actuators that the aperture hardly sees from running to their limits for nothing.
 
     Args:
-        model: of the mirror.
-        limits: of its signals.
         hold_tilt: hold the tilt, if the model has the actuators' positions and its maps show their tilt.
         axis: (2,) m, x and y of where the camera's axis meets the mirror.
 
     Attributes:
-        axis: as given.
         matrix: (R, N), `rows` of the influence function.
         tilt: (2, N) m per unit signal, of the two tilts that are held; None = they are free.
         ridge: weight of the squared signals relative to the squared rows.

@@ -56,11 +56,8 @@ class FoundRecipe:
 
 
 class Kriging:
-    """The best linear estimate of a field of unit variance from samples.
-
-    Args:
-        places: (R, N) effective signals of the samples.
-        noise: (R,) variance of each.
+    """The best linear estimate of a field of unit variance from samples at `places` (R, N), effective signals, with
+    `noise` (R,), the variance of each.
     """
 
     def __init__(self, places: Floats, noise: Floats) -> None:

@@ -118,10 +118,7 @@ class FocusTarget:
     def denied(self, error: float, allowed: float, reachable: tuple[float, float]) -> str:
         """Say that limits do not allow the target, as a sentence.
 
-        Args:
-            error: largest coefficient error that they leave, m.
-            allowed: how large it may be, m.
-            reachable: the curvatures that they permit, 1/m; NaN = none.
+        They leave a largest coefficient error of `error`, m, and permit the curvatures `reachable`, 1/m; NaN = none.
         """
         low, high = reachable
         if math.isnan(low):

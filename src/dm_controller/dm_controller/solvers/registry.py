@@ -40,9 +40,7 @@ def make_solver(
 ) -> Solver:
     """The solver of that name ("" = the default) for one mirror.
 
-    Args:
-        region_weights: (10,) Eq. (8), for AZWreg; None = all equal.
-        mirror: see `Bounded`.
+    `region_weights` are for `AZWreg`, `mirror` for `Bounded`: see there.
 
     Raises:
         UnknownNameError: no such method, listing all.
