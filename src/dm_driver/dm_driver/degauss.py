@@ -22,9 +22,7 @@ def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: in
     vendor's version steps from one to the next with no slew limit.
 
     Args:
-        actuators: number of signals N.
-        middle: signal in the middle of the cycle; with `amplitude` inside the limits.
-        amplitude: first half-swing about the middle.
+        amplitude: first half-swing about the middle, inside the limits.
         steps: half-swings n; r = amplitude (1 - k / n) for k = 0 .. n.
         end: (N,) signals to end in.
     """
@@ -45,10 +43,7 @@ def degauss_move(
     """The decaying cycle about mid range, then the way to `end` (a legal shape).
 
     Args:
-        limits: of the mirror.
-        amplitude: first half-swing; 0 = the largest inside the limits.
-        steps: half-swings.
-        end: (N,) signals to end in.
+        amplitude, steps, end: see `degauss_waypoints`; amplitude 0 = the largest inside the limits.
         duration_max: s, longest time that it may take.
         name: of the parameter or field that gave `steps`, for the refusal.
 

@@ -16,8 +16,7 @@ AWAIT_S = 15.0
 class LinkLog:
     """What to log of the link to the electronics: each change once, and an error only where something is wrong.
 
-    Args:
-        now: steady time of the configuration, s.
+    `now` is the steady time of the configuration, s.
     """
 
     def __init__(self, now: float) -> None:
@@ -47,13 +46,7 @@ def driver_health(
     writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int], trouble: str = ""
 ) -> Health:
     """Judge the driver: level, one line for a person, and counts (refusals since the start, others since the
-    configuration).
-
-    Args:
-        writer: None when the driver is not configured.
-        refusal: of the last command.
-        refused: number of refused commands by the name of their code.
-        trouble: why the configuration was refused; "" = it was not.
+    configuration). Arguments are the attributes of `CommandGate`.
     """
     values: dict[str, object] = {f"refused {name}": count for name, count in sorted(refused.items())}
     if writer is None:

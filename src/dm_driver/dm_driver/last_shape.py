@@ -34,7 +34,6 @@ class LastShape:
 
     Args:
         path: the file; its folder is made. None = nothing is kept.
-        actuators: N.
 
     Raises:
         OSError: the file cannot be made or opened.

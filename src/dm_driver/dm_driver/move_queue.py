@@ -18,7 +18,7 @@ class MoveQueue:
         history_known: every write since a completed degauss over the full range went through.
         degausses: number of such degausses since the writer was enabled.
         turns: number of moves that ended or were abandoned for another since the writer was enabled.
-        turned_at: (N,) what was applied at the last of these turns.
+        turned_at: (N,) what was applied at the last of these turns; None before the first.
     """
 
     def __init__(self, limiter: SafetyLimiter) -> None:
@@ -55,7 +55,6 @@ class MoveQueue:
         """Abandon the current move for `move`.
 
         Args:
-            move: the next.
             shape: (N,) that was written last, before quantisation.
             applied: (N,) what is at the actuators; None before the first write.
         """

@@ -85,21 +85,18 @@ class Counters:
 
 @dataclass(frozen=True)
 class WriterState:
-    """One consistent state of the writer. Arrays are never changed after they were handed out.
+    """One consistent state of the writer; for `requested` and the history see `MoveQueue`, which keeps them.
+
+    Arrays are never changed after they were handed out; `requested` and `applied` are None before the first write.
 
     Attributes:
         link_up: the electronics are open.
         enabled: writes are allowed.
         moving: kind of the move under way; None when the mirror rests or the link is down.
-        requested: (N,) target of the last accepted move; None before the first write.
-        applied: (N,) what is at the actuators, after quantisation; None before the first write.
+        applied: (N,) what is at the actuators, after quantisation.
         volts: (N,) V at the actuators for `applied`.
         stamp_ns: when `applied` was written, in the caller's clock.
         sequence: writes since the writer was enabled.
-        history_known: every write since a completed degauss over the full range went through.
-        degausses: number of such degausses since the writer was enabled.
-        turns: number of moves that ended or were abandoned for another since the writer was enabled.
-        turned_at: (N,) what was applied at the last of these turns; None before the first.
         fault: reason why the link is down; empty when it is up.
     """
 

@@ -27,7 +27,6 @@ class CommandGate:
     """Carries out the commands that are permitted, and keeps the last refusal.
 
     Args:
-        hold: who holds the mirror.
         report: called with a line for the log after each refusal, and, with True, when the mirror was taken over.
 
     Attributes:

@@ -22,13 +22,7 @@ POLL_S, FEEDBACK_S = 0.02, 0.1
 
 
 class DegaussAction:
-    """Serves `degauss` in worker threads; the newest permitted goal pre-empts, a cancelled one slews back.
-
-    Args:
-        node: hosts the action.
-        gate: carries out what may be carried out.
-        values: parameters `degauss.steps` and `degauss.duration_max`.
-    """
+    """Serves `degauss` in worker threads; the newest permitted goal pre-empts, a cancelled one slews back."""
 
     def __init__(self, node: Node, gate: CommandGate, values: Mapping[str, Any]) -> None:
         self._gate, self._values = gate, values

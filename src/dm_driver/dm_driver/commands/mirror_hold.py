@@ -30,11 +30,7 @@ TEXT = text("")
 
 
 class MirrorHold:
-    """The hold of one mirror; may be used from any thread.
-
-    Args:
-        clock: steady time, s.
-    """
+    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock

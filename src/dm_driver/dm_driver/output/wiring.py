@@ -38,7 +38,6 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
         name: a key of `TABLES`, or "custom".
         custom: the channels of actuators 1, 2, ... when `name` is "custom", else empty; `NOT_WIRED` for an actuator
             without a channel.
-        actuators: number of actuators N.
         channels: number of channels of the drive unit.
 
     Returns:
@@ -79,13 +78,7 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
 
 
 class OutputStage:
-    """Wiring and volt scale of one mirror on one drive unit.
-
-    Args:
-        scale: signal to code.
-        channel_of_actuator: (N,) connector channels, `NOT_WIRED` for actuators without one.
-        channels: channels of the drive unit.
-    """
+    """Wiring and volt scale of one mirror on one drive unit, which has this number of `channels`."""
 
     def __init__(self, scale: VoltScale, channel_of_actuator: NDArray[np.intp], channels: int) -> None:
         self.scale = scale
