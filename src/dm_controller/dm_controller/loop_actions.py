@@ -6,12 +6,10 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from dm_msgs.action import BuildRecipes, Converge
 from dm_msgs.msg import Calibration, FocusRequest
 from dm_msgs.srv import StoreRecipes
 
-from dm_common import Floats
 from dm_common.errors import EXPECTED, ErrorCode, MeasurementError, error_code
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros import qos
@@ -127,11 +125,6 @@ class LoopBench(BenchServices):
     def now(self) -> float:
         """ROS time, s."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
-
-    def applied(self) -> Floats | None:
-        """(N,) signals that the driver reports as applied; None = it reports none."""
-        applied = np.array(self.state.applied if self.state is not None else (), dtype=np.float64)
-        return applied if applied.size and np.isfinite(applied).all() else None
 
     def degauss(self, steps: int = 0) -> None:
         """Make the condition that recipes begin with; the driver's own number of steps may differ."""

@@ -84,13 +84,12 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
 
 def _creep(bench: LoopBench) -> Creep | None:
     """Predicts creep by the law in use and the actuators' state; without a law of creep, by the configured rate."""
-    law = bench.active_calibration().planner.law
+    law, state = bench.active_calibration().planner.law, bench.hysteresis()
+    if state is None:  # there is no move from which to predict creep
+        return None
     if law.creep_rate:
-        state = bench.hysteresis()
-        return Creep(law, state, bench.now) if state is not None else None
-    # Without a known present shape, there is no move from which to predict creep.
-    applied = bench.applied()
-    return None if applied is None else Creep.of_rate(bench.parameters["converge.creep"], applied, bench.now)
+        return Creep(law, state, bench.now)
+    return Creep.of_rate(bench.parameters["converge.creep"], state.signals, bench.now)
 
 
 def solver_of(active: ActiveCalibration, method: str) -> Solver:

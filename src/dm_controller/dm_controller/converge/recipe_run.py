@@ -14,7 +14,6 @@ from dm_msgs.srv import StoreRecipes
 from rclpy.client import Client
 
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
-from dm_common.hysteresis.creep_record import rested
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import GOES_ON_WITHOUT, shape_text
 from dm_common.ros.clients import ServiceCallError, call
@@ -87,11 +86,8 @@ class RecipeRun:
             feedback.residual_rms, feedback.max_zernike = step.rms, step.max_zernike
             handle.publish_feedback(feedback)
 
-        state, stands = bench.hysteresis(), bench.applied()
-        if state is None and stands is not None:  # as if long at rest where the driver reports it
-            state = rested(planner.law, stands, bench.now(), active.middle)
         builder = RecipeBuilder(
-            planner, bench, bench.now, options, state=state, on_step=report, cancelled=bench.cancelled
+            planner, bench, bench.now, options, state=bench.hysteresis(), on_step=report, cancelled=bench.cancelled
         )
         code, text = int(ErrorCode.OK), ""
         try:
