@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
+
 #: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid these are the nearest
 #: six; the next ones are sqrt(3) times that distance away.
 NEIGHBOUR_DISTANCE_RATIO = 1.2
@@ -31,7 +33,7 @@ def hexagonal_positions(
     start_angle: float = 0.0,
     clockwise: bool = False,
     reflected: bool = False,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return the positions of a full hexagonal pattern, numbered as OKO's PDM mirrors are.
 
     Actuator 1 is the centre, 2-7 the first ring, 8-19 the second, 20-37 the third; sequential in angle within a ring.
@@ -60,18 +62,18 @@ def hexagonal_positions(
     return (-all_x if reflected else all_x), all_y
 
 
-def pitch(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+def pitch(x: Floats, y: Floats) -> float:
     """Smallest distance between two actuators, in the unit of the positions (N,)."""
     return float(_distances(x, y)[1].min())
 
 
-def _distances(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _distances(x: Floats, y: Floats) -> tuple[NDArray[np.intp], Floats]:
     """The (P, 2) indices of all pairs, the smaller first, and their (P,) distances."""
     pairs = np.column_stack(np.triu_indices(x.size, k=1))
     return pairs, np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]] for places in (x, y)))
 
 
-def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.intp]:
+def neighbour_pairs(x: Floats, y: Floats) -> NDArray[np.intp]:
     """Return the (P, 2) indices, the smaller first, of all pairs closer than 1.2 times the smallest distance.
 
     Args:
@@ -90,7 +92,7 @@ def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[n
     return pairs[distance < NEIGHBOUR_DISTANCE_RATIO * smallest]
 
 
-def rings(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
+def rings(x: Floats, y: Floats) -> NDArray[np.int64]:
     """Ring of each actuator: number of neighbour steps from the actuator nearest to the centroid (ring 0).
 
     Actuators that no chain of neighbours reaches get -1.

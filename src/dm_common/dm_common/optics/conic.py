@@ -5,15 +5,16 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from dm_common import Floats
 from dm_common.optics.zernike import DEFOCUS, TERM_RMS, basis
 
 _RADIAL_NODES = 24
 _ANGLES = 48
 
 
-def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0) -> NDArray[np.float64]:
+def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0) -> Floats:
     """Sag of a conic, Eq. (2); positive curvature is concave (the rim stands above the vertex).
 
     The equation's form with the root in the denominator loses no digits for weak curvatures.
@@ -41,7 +42,7 @@ def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: floa
     return np.asarray(curvature * r2 / (1 + np.sqrt(root)))
 
 
-def conic_coefficients(curvature: float, conic_constant: float, radius: float) -> NDArray[np.float64]:
+def conic_coefficients(curvature: float, conic_constant: float, radius: float) -> Floats:
     """Born & Wolf coefficients of a conic over a circular aperture, by least squares over the full disc.
 
     The terms are orthogonal on the disc, so each coefficient is a projection; the integrals are Gauss-Legendre in r^2
@@ -63,16 +64,14 @@ def conic_coefficients(curvature: float, conic_constant: float, radius: float) -
     return disc_coefficients(lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant))
 
 
-def disc_coefficients(
-    sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
-) -> NDArray[np.float64]:
+def disc_coefficients(sag: Callable[[Floats, Floats], Floats]) -> Floats:
     """(..., 21) Born & Wolf coefficients of `sag`, from points (Q,) of the unit disc to (..., Q), by least squares."""
     x, y, projection = _quadrature()
     return sag(x, y) @ projection
 
 
 @cache
-def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _quadrature() -> tuple[Floats, Floats, Floats]:
     """Points of the unit disc, x and y (Q,), and what takes sag there to coefficients, (Q, 21)."""
     nodes, weights = np.polynomial.legendre.leggauss(_RADIAL_NODES)
     r = np.sqrt((nodes + 1) / 2)
