@@ -216,19 +216,11 @@ class CalibratedMirror:
         return self._programme.solve(rows)
 
     def plan(self, target: FocusTarget) -> Plan:
-        """Find the command for `target` and predict its error.
-
-        Raises:
-            TargetError: no such surface exists over the aperture.
-        """
+        """Find the command for `target` and predict its error. Raises as `target_shape`."""
         return self.predict(target, self.command(target)[0])
 
     def command(self, target: FocusTarget) -> tuple[Floats, float]:
-        """The command (N,) for `target`, and the largest coefficient error that it leaves, m.
-
-        Raises:
-            TargetError: no such surface exists over the aperture.
-        """
+        """The command (N,) for `target`, and the largest coefficient error it leaves, m. Raises as `target_shape`."""
         wanted, tilt = self.wanted(target)
         signals = self.solve(self.rows(wanted, tilt))
         return signals, (response(self.model, signals) - wanted).max_zernike
@@ -238,11 +230,7 @@ class CalibratedMirror:
         return self._programme.unlimited(self.rows(shape, tilt))
 
     def predict(self, target: FocusTarget, signals: Floats) -> Plan:
-        """What `signals` (N,) are expected to do when `target` is wanted.
-
-        Raises:
-            TargetError: no such surface exists over the aperture.
-        """
+        """What `signals` (N,) are expected to do when `target` is wanted. Raises as `target_shape`."""
         model = self.model
         error = response(model, signals) - self.wanted(target)[0]
         rms = float(np.linalg.norm(reduced(error.sag, self._weights, self._terms[:, :PISTON_TILT])))
@@ -260,8 +248,7 @@ class CalibratedMirror:
     def wanted(self, target: FocusTarget) -> tuple[Shape, Floats]:
         """The surface of `target` minus that at zero signals; its tilt minus that of its sphere on the axis, (2,) m.
 
-        Raises:
-            TargetError: no such surface exists over the aperture.
+        Raises as `target_shape`.
         """
         model = self.model
         own = np.array(target.zernike[1:PISTON_TILT]) if target.zernike else np.zeros(2)

@@ -84,8 +84,7 @@ class Solver(ABC):
     def solve(self, wanted: Shape) -> Command:
         """Signals for a surface, without measuring (open loop): from rest, where the model's offset is the surface.
 
-        Raises:
-            ValueError: a shape of other size than the model's, or not finite.
+        Raises as `correct`.
         """
         self._check(wanted)
         return self.limited(self._signals(np.zeros(self.model.influence_zernike.shape[1]), wanted - self.offset))

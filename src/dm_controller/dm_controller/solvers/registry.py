@@ -19,11 +19,7 @@ SOLVERS: dict[str, type[Solver]] = {
 
 
 def named(name: str, solvers: Collection[str]) -> str:
-    """`name`, or the default for "".
-
-    Raises:
-        UnknownNameError: none of `solvers`, listing all.
-    """
+    """`name`, or the default for "". Raises UnknownNameError, listing all `solvers`, if it is none of them."""
     if not name:
         return DEFAULT
     if name not in solvers:
