@@ -21,7 +21,6 @@ from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_common.values import without_figures
-from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import health
@@ -247,7 +246,7 @@ class MoveFocusAction:
 
 
 class DegaussClient:
-    """Calls the driver's degauss, one at a time; no method waits.
+    """Calls the driver's degauss; no method waits.
 
     Args:
         ended: called by the executor with the number of the run, its duration in s, and the refusal (None = done).
@@ -256,7 +255,6 @@ class DegaussClient:
     def __init__(self, node: Node, ended: Callable[[int, float, Refusal | None], None]) -> None:
         self._node, self._ended = node, ended
         self._client = ThreadedActionClient(node, Degauss, "degauss")
-        self._waiting: StartDegauss | None = None
 
     @property
     def offered(self) -> bool:
@@ -264,25 +262,11 @@ class DegaussClient:
         return bool(self._client.server_is_ready())
 
     def start(self, run: StartDegauss) -> None:
-        """Call the driver, or keep `run` until the driver is there."""
-        self._waiting = run
-        self._call()
-
-    def retry(self, run: Run | None) -> None:
-        """Call the driver for a run that is kept, if it is still the one under way; to be called regularly."""
-        if self._waiting is not None and (run is None or run.number != self._waiting.number):
-            self._waiting = None  # given up: the mirror must not swing when a driver comes back
-        self._call()
-
-    def _call(self) -> None:
-        if self._waiting is None or not self._client.server_is_ready():
-            return
-        number, steps, holder, take_over = self._waiting
-        self._waiting = None
-        goal = Degauss.Goal(steps=steps, holder=holder, take_over=take_over)
+        """Call the driver. If it has just gone, nothing comes of it, and `Conditioning.failure` says so."""
+        goal = Degauss.Goal(steps=run.steps, holder=run.holder, take_over=run.take_over)
         # Through the executor: if the answer is there already, this thread would take the node's lock twice.
         self._client.send_goal_async(goal).add_done_callback(
-            lambda done: self._node.executor.create_task(self._accepted, number, done)
+            lambda done: self._node.executor.create_task(self._accepted, run.number, done)
         )
 
     def _accepted(self, number: int, done: Any) -> None:

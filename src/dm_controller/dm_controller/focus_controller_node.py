@@ -132,7 +132,6 @@ class FocusControllerNode(FocusHost):
         with self.controller() as (controller, now):
             gone = f"pdm_driver {qos.GONE}" if self._driver.missing() else ""
             self.carry_out(controller.tick(now, gone), now)
-            self._degauss.retry(controller.conditioning.run)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
     def carry_out(self, effects: Iterable[Effect], now: Moment) -> None:
