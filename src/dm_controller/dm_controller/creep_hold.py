@@ -10,7 +10,7 @@ state does not give the shape that the mirror holds.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -80,17 +80,14 @@ class CreepHold:
         if command.confirmed or now - command.sent.steady > CONFIRM_S:
             self.end("another command came")
 
-    def command(self, estimate: Callable[[float], ActuatorEstimate], now: Moment) -> list[SendCommand]:
-        """The corrections that are due for the shape, by the driver's last report.
-
-        `estimate` gives the actuators at a time, s.
-        """
+    def command(self, estimate: ActuatorEstimate, now: Moment) -> list[SendCommand]:
+        """The corrections that are due for the shape, by the driver's last report and the estimate for `now`."""
         order, report = self._monitor.order, self._monitor.latest
         if order is None or not order.creep_held or report is None or report.moving:
             return []
         if report.holder not in ("", order.request.holder):
             return []  # goes on afterwards if the holder leaves the shape as it is
-        signals = self.correction(estimate(now.time), now.time)
+        signals = self.correction(estimate, now.time)
         return [] if signals is None else [order.send_on(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:

@@ -16,7 +16,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
 from dm_common.messages import stamp_ns
-from dm_controller.focus_types import Log, Moment, Order, Progress, PublishState
+from dm_controller.focus_types import Moment, Order, Progress, PublishState
 
 #: States that a driver does not leave by itself, unlike a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
@@ -57,7 +57,7 @@ class DriverMonitor:
         self.latest: ActuatorState | None = None
         self.starts = 0
         self.gone = ""
-        self._heard = self._gain = 0.0
+        self._heard = 0.0
         # s: this clock minus the steady one, and how far stamps are ahead of each; infinite until known: no gain.
         self._drift, self._ahead = math.inf, (math.inf, math.inf)
         self._stamp: int | None = None
@@ -115,13 +115,7 @@ class DriverMonitor:
             gain = max(gain, min(ahead - self._ahead[0], ahead + drift - self._ahead[1]))
             self._ahead = ahead, ahead + drift
         self._drift, self._stamp = drift, stamp
-        self._gain = gain if gain > CLOCK_JUMP_S and not now.simulated else 0.0
-        return self._gain
-
-    def clock_jumped(self) -> list[Log]:
-        """A warning for the log, if the clock has jumped at the last report."""
-        text = f"the clock jumped {self._gain:.0f} s ahead: whether creep went on for so long counts as not known"
-        return [Log("warning", text)] if self._gain else []
+        return gain if gain > CLOCK_JUMP_S and not now.simulated else 0.0
 
     def silent(self, now: float) -> str:
         """Why the driver counts as silent, as a sentence; "" = it reports, or never did."""

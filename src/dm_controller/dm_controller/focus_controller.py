@@ -103,9 +103,9 @@ class FocusController:
     def driver_report(self, report: ActuatorState, now: Moment) -> list[Effect]:
         """Take the driver's next report."""
         report = unused_as_requested(report)
-        latency_learnt = self.monitor.observe(report, now.steady)
+        latency_learnt, gain = self.monitor.observe(report, now.steady), self.monitor.clock_gain(report, now)
         with suppress(ValueError):  # the observer reports it as an unknown history, and begins anew
-            self.observer.observe(applied_from(report, now.time), self.monitor.clock_gain(report, now))
+            self.observer.observe(applied_from(report, now.time), gain)
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
         elif self.hold.active and self.monitor.stood is None:
@@ -114,7 +114,11 @@ class FocusController:
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
-        return [*effects, *self.monitor.settled(), *self.monitor.clock_jumped(), *self._news(now, latency_learnt)]
+        effects += self.monitor.settled()
+        if gain:
+            text = f"the clock jumped {gain:.0f} s ahead: whether creep went on for so long counts as not known"
+            effects.append(Log("warning", text))
+        return [*effects, *self._news(now, latency_learnt)]
 
     def unavailable(self, now: Moment) -> Refusal | None:
         """The reason why requests are refused now, whatever they ask for; None = they are not."""
@@ -275,7 +279,7 @@ class FocusController:
             effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
         effects += self._news(now)
         if not self.conditioning.run:  # a correction would end the degauss
-            effects += self.hold.command(self.observer.estimate, now)
+            effects += self.hold.command(self.observer.estimate(now.time), now)
         return effects
 
     def quick_ticks(self, now: Moment) -> bool:
