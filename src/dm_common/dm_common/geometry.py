@@ -34,7 +34,7 @@ def hexagonal_positions(
     clockwise: bool = False,
     reflected: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Return the positions of a full hexagonal pattern, numbered as OKO's PDM mirrors are.
+    """Return (N,) x and (N,) y, m, of a full hexagonal pattern, numbered as OKO's PDM mirrors are.
 
     Actuator 1 is the centre, 2-7 the first ring, 8-19 the second, 20-37 the third; sequential in angle within a ring.
     The angle of the first one, the sense and the reflection differ from unit to unit.
@@ -46,9 +46,6 @@ def hexagonal_positions(
             counter-clockwise from x, rad.
         clockwise: numbers rise clockwise instead of counter-clockwise.
         reflected: the finished pattern is mirrored left-right (x to -x), as when seen from behind.
-
-    Returns:
-        (N,) x and (N,) y in m.
     """
     x, y = [np.zeros(1)], [np.zeros(1)]
     corner_angle = np.arange(7) * (math.pi / 3) * (-1.0 if clockwise else 1.0) + start_angle

@@ -87,13 +87,10 @@ class Limits:
         return result
 
     def scaled(self, signals: Floats) -> tuple[Floats, float]:
-        """`signals` (N,) scaled about their mean until they keep every limit.
+        """`signals` (N,) scaled about their mean until they keep every limit, and the factor (1: nothing changed).
 
         A common signal lifts the plate without bending it, so scaling about the mean keeps the shape and changes its
         size.
-
-        Returns:
-            The signals to use and the factor, 1 when nothing had to change.
         """
         mean = float(np.clip(signals.mean(), self.low, self.high))
         departure = signals - signals.mean()

@@ -15,17 +15,14 @@ _ANGLES = 48
 
 
 def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0) -> Floats:
-    """Sag of a conic, Eq. (2); positive curvature is concave (the rim stands above the vertex).
+    """Sag of a conic, m, Eq. (2); positive curvature is concave (the rim stands above the vertex).
 
     The equation's form with the root in the denominator loses no digits for weak curvatures.
 
     Args:
-        x, y: m, of any one shape.
+        x, y: m, of any one shape, which the result has too.
         curvature: axial curvature, 1/m.
         conic_constant: 0 = sphere, -1 = paraboloid.
-
-    Returns:
-        Sag in m, of the shape of x.
 
     Raises:
         ValueError: a number that is not finite, or a point beyond the equator, where the conic has no sag.
@@ -43,18 +40,10 @@ def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: floa
 
 
 def conic_coefficients(curvature: float, conic_constant: float, radius: float) -> Floats:
-    """Born & Wolf coefficients of a conic over a circular aperture, by least squares over the full disc.
+    """(21,) Born & Wolf coefficients, m, of a conic over an aperture of `radius` m, by least squares over the disc.
 
     The terms are orthogonal on the disc, so each coefficient is a projection; the integrals are Gauss-Legendre in r^2
-    and equidistant in angle, exact for the polynomials involved.
-
-    Args:
-        curvature: 1/m; positive = concave.
-        conic_constant: 0 = sphere, -1 = paraboloid.
-        radius: of the aperture, m.
-
-    Returns:
-        (21,) in m.
+    and equidistant in angle, exact for the polynomials involved. The other arguments are those of `conic_sag`.
 
     Raises:
         ValueError: radius not positive, or the conic does not reach out to it.

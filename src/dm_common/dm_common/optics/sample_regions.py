@@ -63,16 +63,13 @@ def disc_shares(points: SamplePoints) -> Floats:
 
 
 def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) -> Floats:
-    """Root mean square about zero of sag samples inside concentric discs, area-weighted.
+    """Root mean square about zero of sag samples inside concentric discs, area-weighted: (M, R), all finite.
 
     Piston and tilt are removed once over the whole aperture, by the caller.
 
     Args:
         sag: (M, P) at the points, NaN = no data; the points with data then represent the region.
         labels: (M,) names of the maps for messages.
-
-    Returns:
-        (M, R), in the unit of the sag; all finite.
 
     Raises:
         EmptyRegionError: a region of some map has no sample.

@@ -60,7 +60,7 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
 
 
 def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: float, points: SamplePoints) -> Floats:
-    """Read a map at the sampling points by the four-neighbour rule of section 2.2.
+    """Read a map at the sampling points by the four-neighbour rule of section 2.2: (P,), in the unit of the sag.
 
     A point on a pixel takes its value; a point on the line between two adjacent pixels the mean of the two; any other
     the mean of its four neighbours. Neighbours without data or beyond the map's border do not count; when none is left,
@@ -70,9 +70,6 @@ def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: f
         sag: (height, width), row 0 = top, NaN = no data.
         centre_x_px, centre_y_px: centre of the aperture from the left and top pixel's centre.
         radius_px: radius of the aperture.
-
-    Returns:
-        (P,), in the unit of the sag.
     """
     x = _snapped(centre_x_px + radius_px * points.x)
     y = _snapped(centre_y_px - radius_px * points.y)  # rows count downwards

@@ -105,13 +105,10 @@ def _radial_factor(n: int, m: int) -> list[float]:
 
 
 def basis(x: ArrayLike, y: ArrayLike) -> Floats:
-    """Evaluate all terms.
+    """Evaluate all terms, in the order of TERMS: S + (21,).
 
     Args:
         x, y: of any one shape S, in units of the aperture's radius. Outside the unit disc the polynomials continue.
-
-    Returns:
-        S + (21,), in the order of TERMS.
     """
     z = np.asarray(x, dtype=float) + 1j * np.asarray(y, dtype=float)
     r2 = z.real**2 + z.imag**2

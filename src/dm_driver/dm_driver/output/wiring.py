@@ -32,16 +32,13 @@ TABLES: Final[dict[str, tuple[int, ...]]] = {
 
 
 def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int) -> NDArray[np.intp]:
-    """Return the connector channel of every actuator.
+    """Return the connector channel, 0..channels-1 or `NOT_WIRED`, of every actuator: (N,).
 
     Args:
         name: a key of `TABLES`, or "custom".
         custom: the channels of actuators 1, 2, ... when `name` is "custom", else empty; `NOT_WIRED` for an actuator
             without a channel.
         channels: number of channels of the drive unit.
-
-    Returns:
-        (N,) channels 0..channels-1, or `NOT_WIRED`.
 
     Raises:
         ValueError: unknown name, wrong length, a channel out of range or used twice.
