@@ -12,37 +12,6 @@ from dm_controller.planning.planner import SETTLE_S
 
 #: Largest distance of the camera's axis from the middle of the mirror, m.
 AXIS_MAX = 0.1
-#: Parameters of the closed loops, for any node that hosts them.
-LOOP_PARAMETERS = (
-    live(
-        "converge.tolerance",
-        real(2e-9, 1e-11, 1e-5, "m"),
-        "largest coefficient error at which a closed loop ends",
-    ),
-    live("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take"),
-    live(
-        "converge.creep",
-        real(0.01, 0.0, 0.2),
-        "creep that a closed loop assumes if none was identified: growth of a move per decade of time; 0 = none",
-    ),
-    live(
-        "recipes.tolerance",
-        real(6.3e-10, 1e-11, 1e-5, "m"),
-        "largest re-measured coefficient error of a recipe",
-    ),
-    live("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take"),
-    live("recipes.average", whole(8, 2, 50), "largest number of maps averaged after each degauss of a recipe"),
-    Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
-    Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
-    Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
-    live("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed"),
-    Parameter(
-        "recipes.degauss_steps",
-        whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX),
-        "half-swings of the degauss that recipes begin with",
-    ),
-    Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
-)
 
 #: For requests and recipes alike.
 REACHABLE_TOLERANCE: Final = Parameter(
@@ -123,7 +92,35 @@ PARAMETERS: Final = (
         "x and y of the point where the camera's axis meets the mirror, from the centre of the calibrated aperture: "
         "the picture does not move if the vertex of the sphere stays there; `./dm calibrate --boresight` finds it",
     ),
-    *LOOP_PARAMETERS,
+    # Of the closed loops.
+    live(
+        "converge.tolerance",
+        real(2e-9, 1e-11, 1e-5, "m"),
+        "largest coefficient error at which a closed loop ends",
+    ),
+    live("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take"),
+    live(
+        "converge.creep",
+        real(0.01, 0.0, 0.2),
+        "creep that a closed loop assumes if none was identified: growth of a move per decade of time; 0 = none",
+    ),
+    live(
+        "recipes.tolerance",
+        real(6.3e-10, 1e-11, 1e-5, "m"),
+        "largest re-measured coefficient error of a recipe",
+    ),
+    live("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take"),
+    live("recipes.average", whole(8, 2, 50), "largest number of maps averaged after each degauss of a recipe"),
+    Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
+    Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
+    Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
+    live("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed"),
+    Parameter(
+        "recipes.degauss_steps",
+        whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX),
+        "half-swings of the degauss that recipes begin with",
+    ),
+    Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
 
 #: Allowed values of the fields of goals; the shape that they request is judged with the mirror at hand.

@@ -42,7 +42,7 @@ class LoopBench(BenchServices):
     """Driver and interferometer for one goal of either action at a time, with what the focus controller knows.
 
     Attributes:
-        parameters: of `node`, LOOP_PARAMETERS among them.
+        parameters: of `node`.
     """
 
     def __init__(self, node: FocusHost, values: Mapping[str, Any]) -> None:
