@@ -85,8 +85,8 @@ CANDIDATES = (
     Candidate("Duhem", 0, 3, 4),
     Candidate("Preisach and Duhem", 20, 3, 4),
     Candidate("static, each actuator its own", 0, 5, 0, own=True),
-    Candidate("Preisach, each actuator its own", 30, 12, 0, own=True),
-    Candidate("Preisach and Duhem, each actuator its own", 30, 12, 4, own=True),
+    Candidate("Preisach, each actuator its own", 30, 10, 0, own=True),
+    Candidate("Preisach and Duhem, each actuator its own", 30, 10, 4, own=True),
 )
 #: The candidates with one law for all actuators.
 COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)

@@ -1,7 +1,5 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from dm_common import Floats
@@ -14,9 +12,13 @@ EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
 #: Least creep rate, per decade of time, that a prior assumes.
 RATE_MIN = 1e-3
 
-#: Prior of the weights: overall standard deviation, and decay length of their variance over the half-width. Held-out
-#: errors change by less than a tenth when one of them is doubled or halved.
-AMPLITUDE, DECAY = 0.2, 0.35
+#: Number of patterns of the prior that are kept.
+PATTERNS = 60
+#: Prior of the weights: overall standard deviation, and the power with which the variance falls with the order.
+#: Held-out errors change by less than a tenth when any of these two and the next two is doubled or halved.
+AMPLITUDE, ORDER_POWER = 0.2, 3.0
+#: Correlation length of the weights over the half-width, and decay length of their variance.
+CORRELATION, DECAY = 0.5, 0.35
 #: Variance of the loading curve, relative to that of all play operators together.
 LOADING = 0.3
 #: An actuator's own Duhem operator: fewest coefficients, number of first-order updates of them, and the weight of the
@@ -26,25 +28,6 @@ DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
 #: Number of rows for which creep is computed at a time.
 BLOCK = 32
-
-
-class DensityPrior(NamedTuple):
-    """How smooth the density of relays is taken to be.
-
-    Attributes:
-        patterns: number of the strongest patterns that are kept.
-        order_power: power with which the variance of the weights falls with the order.
-        correlation: length over the half-width.
-    """
-
-    patterns: int
-    order_power: float
-    correlation: float
-
-
-#: For runs of at least ROUGH_MAPS maps per actuator, which show finer structure, and for shorter ones, where the rough
-#: prior would make errors up to three times as large.
-ROUGH, SMOOTH, ROUGH_MAPS = DensityPrior(90, 2.0, 0.2), DensityPrior(60, 3.0, 0.5), 7
 
 
 def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
@@ -65,15 +48,15 @@ def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.
     return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
 
 
-def pattern_basis(radius: Floats, orders: int, prior: DensityPrior) -> Floats:
+def pattern_basis(radius: Floats, orders: int) -> Floats:
     """(R D, K) strongest patterns of the prior over half-widths and orders, scaled to weights of unit variance."""
     away = np.abs(np.subtract.outer(radius, radius))
-    smooth = np.exp(-away / prior.correlation - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
+    smooth = np.exp(-away / CORRELATION - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
     smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is independent of the loops
     smooth[0, 0] = LOADING
-    order = np.arange(1, orders + 1, dtype=np.float64) ** -prior.order_power
+    order = np.arange(1, orders + 1, dtype=np.float64) ** -ORDER_POWER
     size, axes = np.linalg.eigh(AMPLITUDE**2 * np.kron(smooth, np.diag(order)))
-    strongest = np.argsort(size)[::-1][: prior.patterns]
+    strongest = np.argsort(size)[::-1][:PATTERNS]
     return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
 
 

@@ -2,12 +2,12 @@
 
 Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
 any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r. A Gaussian prior
-makes them similar for neighbouring r and small for high orders; only its strongest patterns are kept, so that sixty or
-ninety numbers per actuator describe a law. The patterns of all actuators are drawn towards each other: weights that the
-maps hardly determine for one actuator become the mean of the others. Creep is a spectrum over the elements of the
-model, smooth over the logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a
-spectrum of their own, since loops are wider for fast moves, and creep may change over the range. Low-order shapes move
-all actuators alike, so what is left out here does not average out in them: it would pass for slow creep.
+makes them similar for neighbouring r and small for high orders; only its strongest patterns are kept, so that sixty
+numbers per actuator describe a law. The patterns of all actuators are drawn towards each other: weights that the maps
+hardly determine for one actuator become the mean of the others. Creep is a spectrum over the elements of the model,
+smooth over the logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum
+of their own, since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all
+actuators alike, so what is left out here does not average out in them: it would pass for slow creep.
 
 Responses are linear in the gains of the actuators, in their patterns and in their spectra. Each of the three is solved
 for in turn by regularised least squares, given the other two. The patterns of all actuators are one system, since the
@@ -25,9 +25,6 @@ from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Rows
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
     PER_ELEMENT,
-    ROUGH,
-    ROUGH_MAPS,
-    SMOOTH,
     fading_changes,
     own_slopes,
     padded_slope,
@@ -112,8 +109,7 @@ class OwnLaws:
         self.run, self.candidate, self._scatter, self._slope_min = run, candidate, scatter, slope_min
         self._slope = common.duhem_slope
         radius, orders = candidate.radius, candidate.powers
-        rough = len(run.signals) >= ROUGH_MAPS * run.signals.shape[1]
-        self._basis = pattern_basis(radius, orders, ROUGH if rough else SMOOTH)
+        self._basis = pattern_basis(radius, orders)
         signals = run.signals - run.rest
         values = run.along(lambda signals: play_values(signals, radius, run.rest))
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.full(1, run.rest), orders)[0, 1:]
