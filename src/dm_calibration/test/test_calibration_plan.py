@@ -93,7 +93,7 @@ def test_moves_in_use_follow_a_degauss_with_a_map_at_rest() -> None:
     degausses = [number for number, kind in enumerate(kinds) if kind is StepKind.DEGAUSS][1:]
     assert len(degausses) == len(plan.ends) + 1
     whole = make_plan(PlanKind.HYSTERESIS, make_mirror(rings=1)).steps
-    assert [step.label for step in whole if step.kind is StepKind.DEGAUSSED] == ["degaussed 160", "degaussed 180"]
+    assert [step.label for step in whole if step.kind is StepKind.DEGAUSSED] == ["degaussed 240", "degaussed 270"]
     for number in degausses:
         at_rest = plan.steps[number + 1]
         assert at_rest.kind is StepKind.DEGAUSSED and at_rest.signals is not None and not at_rest.signals.any()

@@ -65,7 +65,7 @@ def test_degausses_in_the_course_of_a_run_begin_no_new_one(bench: LinearBench, m
     """Where a map after one fails the history knows of it all the same, as of a reference frame in between; one that
     was interrupted is made again.
     """
-    bench.failing = {"degaussed 160": 9, "reference 2": 9}
+    bench.failing = {"degaussed 240": 9, "reference 2": 9}
     plan = make_plan(PlanKind.HYSTERESIS, mirror)
     outcome = run(bench, mirror, PlanKind.HYSTERESIS).outcome
     assert [move.degauss for move in bench.moves].count(True) == 3
@@ -228,7 +228,7 @@ def test_no_maps_at_all(bench: LinearBench, mirror: Mirror) -> None:
         Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()
 
 
-@pytest.mark.parametrize(("kind", "count"), [(StepKind.CHECK, 40), (StepKind.IN_USE, 43)])
+@pytest.mark.parametrize(("kind", "count"), [(StepKind.CHECK, 60), (StepKind.IN_USE, 83)])
 def test_shapes_as_in_use_are_on_the_flat_surface(kind: StepKind, count: int) -> None:
     """As in use: the figure is gone, and what is left is the shape of the plan."""
     mirror = make_mirror(neighbour_difference_max=1.0)
