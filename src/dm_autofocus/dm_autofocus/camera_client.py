@@ -18,6 +18,7 @@ from dm_autofocus.images import grey, pixels_of
 from dm_autofocus.sharpness import check_region, cut
 from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
 from dm_client.fields import filled
+from dm_common import Floats
 from dm_common.errors import ErrorCode
 from dm_common.messages import seconds as seconds_of
 from dm_common.optics.zernike import PISTON_TILT, TERMS
@@ -172,7 +173,7 @@ class CameraFocusClient(DeformableMirrorClient):
         step = STEP * reach.curvature_tolerance
         focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
 
-        def see(curvature: float, tilt: NDArray[np.float64]) -> NDArray:
+        def see(curvature: float, tilt: Floats) -> NDArray:
             zernike = np.zeros(len(TERMS))
             zernike[1:PISTON_TILT] = tilt
             state = self.focus(curvature, zernike=zernike.tolist(), **claim)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dm_autofocus.search.peak_search import SIGNIFICANCE, is_hill
 from dm_autofocus.sharpness import local_tenengrad
+from dm_common import Floats
 
 #: Fewest images of a stack.
 FEWEST = 5
@@ -67,7 +68,7 @@ class ImageStack:
         rows, columns = (np.minimum(np.arange(side) // self._side, count - 1) for side, count in sides)
         return cells[rows[:, None], columns]
 
-    def in_focus(self, least_contrast: float) -> NDArray[np.float64]:
+    def in_focus(self, least_contrast: float) -> Floats:
         """Curvature at which each cell is in focus [1/m]: NaN = none, -inf or inf = beyond the first or last position.
 
         Args:

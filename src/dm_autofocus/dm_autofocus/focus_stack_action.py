@@ -17,6 +17,7 @@ from dm_autofocus.images import PLANAR, exposure_fault, grey, pixels_of
 from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerGoal
@@ -40,7 +41,7 @@ class FocusStackAction(ProbeAction):
         self._depth = node.create_publisher(Image, "focus_stack/depth", qos.LATCHED)
         self._info = node.create_publisher(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
 
-    def _plan(self, goal: Any) -> NDArray[np.float64]:
+    def _plan(self, goal: Any) -> Floats:
         """Curvatures of the images, in rising order, so that unknown hysteresis stays on one branch."""
         capabilities = ready_capabilities(self._probe)
         low, high = range_of(goal, capabilities)
@@ -49,7 +50,7 @@ class FocusStackAction(ProbeAction):
         step = self._values["stack.step"] * tolerance_of(self._values, capabilities.aperture_radius)
         return np.linspace(low, high, goal.images or min(max(NOISE_POINTS, 1 + math.ceil((high - low) / step)), MOST))
 
-    def _carry_out(self, goal_handle: WorkerGoal, plan: NDArray[np.float64], result: Any) -> None:
+    def _carry_out(self, goal_handle: WorkerGoal, plan: Floats, result: Any) -> None:
         before = self._probe.shape
         stack, image = self._sweep(goal_handle, plan)
         if math.isfinite(before[0]):
@@ -70,7 +71,7 @@ class FocusStackAction(ProbeAction):
         result.distance_near, result.distance_far, result.stamp = float(near), float(far), image.header.stamp
         result.message = f"{len(stack.positions)} images, {100 * result.share:.0f} % of the pixels have a distance"
 
-    def _sweep(self, goal_handle: WorkerGoal, plan: NDArray[np.float64]) -> tuple[ImageStack, Image]:
+    def _sweep(self, goal_handle: WorkerGoal, plan: Floats) -> tuple[ImageStack, Image]:
         """The stack and its last image. Curvatures that the mirror refuses at the ends of the range are left out."""
         stack = ImageStack(self._values["stack.cell"])
         image = Image()

@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.values import parameter, real
 
@@ -107,7 +107,7 @@ class FocusOptics:
             return at_pupil / rest
         return math.nan if at_pupil > 0 else -math.inf
 
-    def distances_for(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances_for(self, curvature: Floats) -> Floats:
         """Distances [m] in focus at curvatures [1/m], any shape: inf = infinity and beyond, NaN = inside the camera.
 
         Curvatures of NaN, -inf and inf give NaN, inf and -inf: "nothing", "too far" and "too near" of REP 117.

@@ -17,12 +17,12 @@ Clipping the unconstrained solution instead can double the residual of a saturat
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dgels, dtrtrs
 from scipy.optimize import lsq_linear, nnls
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.limits import SLACK, Limits
 
 #: A signal this close to an end of its range is taken to be bound there.
@@ -136,7 +136,7 @@ class BoundedProgramme:
             at_low, at_high = below, above
         return None
 
-    def _with_bound(self, at_low: NDArray[np.bool_], at_high: NDArray[np.bool_], projected: Floats) -> Floats:
+    def _with_bound(self, at_low: Bools, at_high: Bools, projected: Floats) -> Floats:
         """Signals (N,) with the marked ones at an end of the range and the least-squares solution for the others."""
         signals = np.where(at_low, self.limits.low, np.where(at_high, self.limits.high, 0.0))
         free = ~(at_low | at_high)

@@ -4,8 +4,7 @@ import difflib
 from collections.abc import Iterable
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
+from dm_common import Bools
 
 
 class ErrorCode(IntEnum):
@@ -70,7 +69,7 @@ class Refusal(CodedError):
         actuators: (N,) bool, True for the actuators at fault; None when it is not about single actuators.
     """
 
-    def __init__(self, error_code: int, message: str, actuators: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, error_code: int, message: str, actuators: Bools | None = None) -> None:
         super().__init__(message)
         self.error_code = error_code
         self.actuators = actuators

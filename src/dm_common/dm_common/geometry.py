@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Floats, Ints
 
 #: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid these are the nearest
 #: six; the next ones are sqrt(3) times that distance away.
@@ -89,7 +89,7 @@ def neighbour_pairs(x: Floats, y: Floats) -> NDArray[np.intp]:
     return pairs[distance < NEIGHBOUR_DISTANCE_RATIO * smallest]
 
 
-def rings(x: Floats, y: Floats) -> NDArray[np.int64]:
+def rings(x: Floats, y: Floats) -> Ints:
     """Ring of each actuator: number of neighbour steps from the actuator nearest to the centroid (ring 0).
 
     Actuators that no chain of neighbours reaches get -1.

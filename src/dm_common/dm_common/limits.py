@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 
 #: Violations below this are rounding, far below a DAC step (1.5e-5).
 SLACK = 1e-9
@@ -78,7 +78,7 @@ class Limits:
             return True
         return bool(self.differences(signals).max() <= self.neighbour_difference + SLACK)
 
-    def at_limit(self, signals: Floats) -> NDArray[np.bool_]:
+    def at_limit(self, signals: Floats) -> Bools:
         """(N,) which actuators are at a limit."""
         result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
         if self.neighbours_can_bind:

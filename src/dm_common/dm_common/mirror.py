@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Floats, Ints
 from dm_common.limits import Limits
 
 #: Largest relative difference between the aperture radii of a calibration and of the mirror that it belongs to.
@@ -52,7 +51,7 @@ class Mirror:
         return np.full(self.actuators, self.limits.middle)
 
     @property
-    def rings(self) -> NDArray[np.int64]:
+    def rings(self) -> Ints:
         """(N,) ring of each actuator: see :func:`~dm_common.geometry.rings`."""
         from dm_common.geometry import rings  # only calibrations ask
 

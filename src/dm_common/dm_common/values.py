@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 
 T = TypeVar("T")
@@ -98,7 +98,7 @@ class Value:
         elif size:
             self._check_numbers(name, np.asarray(given, dtype=float), "")
 
-    def _check_numbers(self, name: str, given: NDArray[np.float64], subject: str) -> None:
+    def _check_numbers(self, name: str, given: Floats, subject: str) -> None:
         """`subject`: name and value as they were given; "" = name the first wrong element of an array."""
         right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
         if self.zero:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.values import from_values
@@ -34,8 +34,8 @@ class DriverConfiguration:
         electronics: the back end, not yet opened.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
+    x: Floats
+    y: Floats
     limiter: SafetyLimiter
     output: OutputStage
     safe_shape: Shape
@@ -124,7 +124,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     )
 
 
-def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _positions(values: Mapping[str, Any], actuators: int) -> tuple[Floats, Floats]:
     x = np.array(values["mirror.actuator_x"], dtype=np.float64)
     y = np.array(values["mirror.actuator_y"], dtype=np.float64)
     if x.size == 0 and y.size == 0:

@@ -5,9 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
-import numpy as np
-from numpy.typing import NDArray
-
+from dm_common import Floats
 from dm_driver.safety_limiter import Shape
 
 
@@ -105,7 +103,7 @@ class WriterState:
     moving: Kind | None
     requested: Shape | None
     applied: Shape | None
-    volts: NDArray[np.float64] | None
+    volts: Floats | None
     stamp_ns: int
     sequence: int
     history_known: bool

@@ -10,13 +10,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from dm_common import Bools, Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import SLACK, Limits
 from dm_common.values import parameter, real
 
-Shape = NDArray[np.float64]
+Shape = Floats
 
 #: Margin of the check before the write, for the additional rounding of interpolation.
 _ROUNDING = 1e-12
@@ -192,7 +193,7 @@ class Watchdog:
         return now >= self.deadline
 
 
-def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: NDArray[np.bool_], rule: str) -> None:
+def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: Bools, rule: str) -> None:
     """Raise Refusal naming the first of the actuators `at_fault` (N,), if any, and the rule it breaks."""
     if at_fault.any():
         first, others = int(at_fault.argmax()), int(at_fault.sum()) - 1

@@ -10,9 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from dm_common import Floats
 from dm_driver.electronics.base import DriveElectronics, ElectronicsError
 from dm_driver.last_shape import LastShape
 from dm_driver.move_queue import MoveQueue
@@ -76,7 +74,7 @@ class WriterThread:
         self._queue = MoveQueue(limiter)
         self._shape: Shape | None = None  # before quantisation; ramps start here, so that rounding cannot add up
         self._applied: Shape | None = None  # what a write has left at the actuators; None before the first
-        self._volts: NDArray[np.float64] | None = None
+        self._volts: Floats | None = None
         self._written_ns = 0
         self._sequence = self._turns_published = 0
         self._write_at = self._check_at = self._retry_at = 0.0

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dm_autofocus.images import pixels_of
 from dm_calibration.optics.map_fit import MapFitter
+from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.target import FocusTarget
 
@@ -22,7 +23,7 @@ class SurfaceError:
         max_zernike: m, largest coefficient error beyond tilt.
     """
 
-    residual: NDArray[np.float64]
+    residual: Floats
     rms: float
     max_zernike: float
 

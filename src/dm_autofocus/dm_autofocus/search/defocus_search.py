@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.search.defocus_model import TRANSFER_ERROR, DefocusModel, Floats
+from dm_autofocus.search.defocus_model import TRANSFER_ERROR, DefocusModel
 from dm_autofocus.search.peak_search import (
     MOST_REFUSALS,
     NOISE_POINTS,
@@ -24,6 +24,7 @@ from dm_autofocus.search.peak_search import (
     Step,
     is_hill,
 )
+from dm_common import Bools, Floats
 
 #: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
 EVIDENCE = 25.0
@@ -131,7 +132,7 @@ class DepthFromDefocus(Search):
             self.phase = Phase.FINE
             self._confirm(places, sharpness, int(np.where(near, sharpness, -np.inf).argmax()), side)
 
-    def _hill(self, places: Floats, sharpness: Floats) -> NDArray[np.bool_]:
+    def _hill(self, places: Floats, sharpness: Floats) -> Bools:
         """Images that count: those near the sharpest if it is far sharper than all others, else all.
 
         In images far from the focus, objects at other distances beside the region blur into it.

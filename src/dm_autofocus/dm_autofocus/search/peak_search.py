@@ -19,6 +19,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Bools
 from dm_common.values import parameter, real, whole
 
 #: Least height of the top of a hill above the median of its sweep, in standard deviations of the noise.
@@ -245,7 +246,7 @@ class PeakSearch(Search):
         self._begin(low, high, self.config.fine_points)
 
 
-def is_hill(seen: NDArray, least_contrast: float) -> NDArray[np.bool_]:
+def is_hill(seen: NDArray, least_contrast: float) -> Bools:
     """Whether sweeps rise by the least contrast, and by more than noise does.
 
     The noise is estimated from the second differences: those of a hill are small, or large at a few points only, which

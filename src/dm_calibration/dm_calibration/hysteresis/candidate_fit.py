@@ -11,17 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from dm_calibration.hysteresis.features import play_features
 from dm_calibration.hysteresis.run import Run, basis_of, without
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
-
-Rows = NDArray[np.bool_]
 
 #: Ridge on the weights, relative to the mean diagonal of the normal matrix: smooths weights that data do not separate.
 RIDGE = 1e-6
@@ -116,7 +113,7 @@ class CandidateProblem:
         self._scatter = scatter
         self._measured = run.responses.values / scatter
 
-    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
+    def fit(self, keep: Bools, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
         """Fit to the rows in `keep` (M,), starting from `start` or, without it, from a guess.
 
         Args:
@@ -164,7 +161,7 @@ class CandidateProblem:
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 
-    def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:
+    def _solve(self, features: Floats, keep: Bools, weights: Floats | None) -> tuple[Floats, Floats]:
         """Weights (F,), residual (M, D) in units of the scatter."""
         if weights is None:
             weights = np.eye(features.shape[1])[0]

@@ -15,10 +15,9 @@ puts it into the figure, and requests after a degauss are off by a constant.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.mirror import Mirror
 
 #: Share of the maps that test the law.
@@ -65,8 +64,8 @@ class Excitation:
     signals: Floats
     dwell: Floats
     settle_share: Floats
-    in_use: NDArray[np.bool_]
-    check: NDArray[np.bool_]
+    in_use: Bools
+    check: Bools
 
     @property
     def degaussed(self) -> tuple[int, ...]:

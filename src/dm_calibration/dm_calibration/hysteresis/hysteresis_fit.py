@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_calibration.hysteresis.actuator_weights import weights_of
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Rows
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, basis_of, run_of, without
 from dm_calibration.influence.maps import MapSet, StepKind
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis.inverse import random_histories
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
@@ -83,7 +83,7 @@ def fit_hysteresis(
     )
 
 
-def _without_outliers(run: Run, test: Rows, candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
+def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
     """Identify the law without outliers; in the run returned only the other maps are usable, all commands stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
@@ -94,7 +94,7 @@ def _without_outliers(run: Run, test: Rows, candidates: Sequence[Candidate]) -> 
     return identify(run, test, candidates), run
 
 
-def _agreeing(used: Rows, residual: Floats) -> Rows:
+def _agreeing(used: Bools, residual: Floats) -> Bools:
     """(M,) rows in `used` whose `residual` (M, D) is not an outlier; all rows in `used` if outliers are too many."""
     size = np.linalg.norm(residual, axis=1)
     outlier = used & (size > OUTLIER * np.median(size[used]))

@@ -11,13 +11,13 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit, Rows
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit
 from dm_calibration.hysteresis.excitation import MAPS_PER_ACTUATOR
 from dm_calibration.hysteresis.own_laws import OwnFit, OwnLaws
 from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.model import CREEP_RATE_MAX
 
@@ -83,7 +83,7 @@ class Identification:
 
 def identify(
     run: Run,
-    test: Rows | None = None,
+    test: Bools | None = None,
     candidates: Sequence[Candidate] = CANDIDATES,
     folds: int = 4,
     blocks: int = 1,
@@ -172,7 +172,7 @@ def identify(
 
 
 def _begun(
-    run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Rows, slope_min: float
+    run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Bools, slope_min: float
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
     """Own laws that begin with each of the common laws `starts`, fitted to the rows `keep`, in the order to be tried.
 
@@ -235,7 +235,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     return tuple(quiet.tolist())
 
 
-def _scatter(run: Run, keep: Rows) -> Floats:
+def _scatter(run: Run, keep: Bools) -> Floats:
     """(D,) uncertainty of each response, from residuals of a rich law: one value for coefficients, one per pattern."""
     responses = run.responses
     scatter = np.where(np.arange(responses.values.shape[1]) < responses.coefficients, 1e-9, 1e-8)

@@ -21,7 +21,7 @@ from numpy.polynomial import legendre
 from scipy.linalg import block_diag
 
 from dm_calibration.hysteresis.actuator_weights import SPREAD, alike, likeliest_spread, weights_of
-from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Rows
+from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
     PER_ELEMENT,
@@ -36,7 +36,7 @@ from dm_calibration.hysteresis.features import (
 )
 from dm_calibration.hysteresis.run import Run, basis_of, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised, slope_min
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
@@ -53,7 +53,7 @@ SPECTRUM_CORRELATION = 12.0
 #: Loops may have another spectrum over elements of up to LAG_S (s); LAG: prior standard deviation of the difference.
 LAG_S, LAG = 30.0, 0.02
 LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
-#: Rows of the weights of creep: its elements, and what they add for loops; the last row is the change of creep.
+#: Bools of the weights of creep: its elements, and what they add for loops; the last row is the change of creep.
 ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
@@ -86,7 +86,7 @@ class OwnFit(LawFit):
     patterns: Floats
     creep: Floats
     scatter: Floats
-    changed: Rows
+    changed: Bools
 
 
 class OwnLaws:
@@ -133,7 +133,7 @@ class OwnLaws:
         self._signal_states = self.run.creep_states(signals)
         self._creep_between = alike(signals.shape[1], SPECTRUM_SPREAD)
 
-    def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
+    def fit(self, keep: Bools, start: LawFit | None = None) -> OwnFit:
         """Fit to the rows in `keep` (M,), from `start`, whose Duhem operators are kept, or from no hysteresis."""
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
@@ -194,7 +194,7 @@ class OwnLaws:
         return self.run.along(lambda signals: fading_changes(signals, slope, self.run.rest))
 
     def _rounds(
-        self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
+        self, features: Floats, keep: Bools, patterns: Floats, creep: Floats, scatter: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after all rounds."""
         sigma = np.full(features.shape[1], DUHEM_CHANGE)
@@ -274,7 +274,7 @@ class OwnLaws:
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
-        self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats
+        self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Bools, free: Floats
     ) -> Floats:
         """(J + L + 1, N) weights of the creep elements, what they add for loops, and the change of creep."""
         elements = self.run.creep_states(position)

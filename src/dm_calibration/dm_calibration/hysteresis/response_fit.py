@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.hysteresis.model import HysteresisModel
 
 #: Laws that are compared: those of a calibration, and a quadratic one between the linear and the cubic.
@@ -107,7 +107,7 @@ def identify_response(
     seconds = _seconds(times, len(signals))
     if not np.ptp(seconds) > 0.0:
         raise ValueError("times: all are the same; leave them out where they are not known")
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+    usable: Bools = np.asarray(np.isfinite(values).all(axis=1))
     if not usable.any():
         raise ValueError("measured: each row holds NaN or an infinity; leave out columns that do in all rows")
     size = float(values[usable].std(axis=0).max())
@@ -147,7 +147,7 @@ def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
 
 def check_signals(signals: Floats) -> None:
     """Raise ValueError where `signals` (M, N) are not finite or not normalised (volts, for instance)."""
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
+    finite: Bools = np.asarray(np.isfinite(signals).all(axis=1))
     if not finite.all():
         raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")
     if np.abs(signals).max() > 1.0 + 1e-9:
@@ -163,6 +163,6 @@ def _seconds(times: ArrayLike | None, count: int) -> Floats:
     return seconds - seconds[0]
 
 
-def _first(rows: NDArray[np.bool_]) -> int:
+def _first(rows: Bools) -> int:
     """Number of the first of `rows` that is true, from 1."""
     return int(rows.argmax()) + 1

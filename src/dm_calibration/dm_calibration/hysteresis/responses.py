@@ -8,11 +8,10 @@ actuators shows at most N patterns, so the sag is projected onto those, and each
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
@@ -97,7 +96,7 @@ class Responses:
 
     values: Floats
     coefficients: int
-    usable: NDArray[np.bool_]
+    usable: Bools
 
     def scatter(self, size: Floats) -> Floats:
         """(D,) m, uncertainty of each response from residuals of `size` (D,): one value for all coefficients."""
@@ -112,9 +111,7 @@ def responses_of(maps: MapSet) -> Responses:
     Raises:
         TooFewMapsError: no map can be used.
     """
-    usable: NDArray[np.bool_] = np.asarray(
-        np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1)
-    )
+    usable: Bools = np.asarray(np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1))
     if not usable.any():
         raise TooFewMapsError(f"none of the {len(maps)} maps holds data")
     sag = remove_piston_tilt(maps.sag[usable], maps.points)

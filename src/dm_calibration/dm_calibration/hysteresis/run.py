@@ -11,12 +11,11 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.features import EVEN, creep_states, crept, fading_features, follow, relaxation
 from dm_calibration.hysteresis.responses import Responses, responses_of
 from dm_calibration.influence.maps import BEFORE_FIRST_MAP_S, MapSet
-from dm_common import Floats
+from dm_common import Bools, Floats, Ints
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import HysteresisModel
 
@@ -47,8 +46,8 @@ class Run:
     responses: Responses
     start: float = -BEFORE_FIRST_MAP_S
     moved: Floats | None = None
-    segment: NDArray[np.int64] | None = None
-    degaussed: NDArray[np.bool_] | None = None
+    segment: Ints | None = None
+    degaussed: Bools | None = None
     rest: float = 0.0
     limits: tuple[float, float] | None = None
 
@@ -149,7 +148,7 @@ class Run:
             columns += [step, fading]
         return np.column_stack(columns)
 
-    def gains(self, effective: Floats, keep: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    def gains(self, effective: Floats, keep: Bools) -> tuple[Floats, Floats]:
         """Gains (N, D) of effective signals (M, N), fitted to the rows in `keep` (M,), and all residuals (M, D), m."""
         design, values = np.hstack((self.figure, effective)), self.responses.values
         solution: Floats = np.asarray(np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0], dtype=np.float64)

@@ -13,12 +13,11 @@ from functools import cache, lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy import linalg
 
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_moments import MaskedMoments, mask_moments
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.optics.zernike import MAX_ORDER, TERM_RMS, TERMS, basis
 
 #: Exponents (a, b) of the products P_a(x) P_b(y).
@@ -76,7 +75,7 @@ def _zernike_from_products() -> Floats:
 
 
 @lru_cache(maxsize=4)
-def _disc(aperture: Aperture, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _disc(aperture: Aperture, shape: tuple[int, int]) -> Bools:
     """The aperture's pixels, which often stay the same from map to map where the valid ones change."""
     disc = aperture.disc(shape)
     disc.flags.writeable = False
@@ -89,7 +88,7 @@ class MapFitter:
     Creation takes a few times as long as a fit, so keep it as long as the mask repeats. Not thread-safe.
     """
 
-    def __init__(self, mask: NDArray[np.bool_], centre_x_px: float, centre_y_px: float, radius_px: float) -> None:
+    def __init__(self, mask: Bools, centre_x_px: float, centre_y_px: float, radius_px: float) -> None:
         """Prepare the Gram matrix.
 
         Args:
@@ -145,7 +144,7 @@ class MapFitter:
         inverse = linalg.cho_solve(self._factor, np.eye(len(TERMS)))
         self._sigma_per_pixel_noise = np.sqrt(np.diag(inverse)) / scale
 
-    def fits(self, mask: NDArray[np.bool_], aperture: Aperture) -> bool:
+    def fits(self, mask: Bools, aperture: Aperture) -> bool:
         """Whether this fitter was made for this aperture and mask (as far as the mask lies inside the aperture)."""
         if aperture != self.aperture or mask.shape != self._shape:
             return False

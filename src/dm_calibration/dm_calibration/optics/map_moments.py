@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm
 from scipy.sparse import csr_array
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 
 #: Bytes of a block: with the data read meanwhile it fits in a second-level cache of 0.5 to 1 MB.
 _BLOCK_BYTES = 384 * 1024
@@ -45,7 +45,7 @@ class _Block:
 class MaskedMoments:
     """Moments and energy of maps over the pixels of one mask."""
 
-    def __init__(self, mask: NDArray[np.bool_], rows_basis: Floats, columns_basis: Floats) -> None:
+    def __init__(self, mask: Bools, rows_basis: Floats, columns_basis: Floats) -> None:
         """Find the unused pixels of each block.
 
         Args:
@@ -94,7 +94,7 @@ class MaskedMoments:
         return sums.T @ self._columns_basis, energy
 
 
-def mask_moments(mask: NDArray[np.bool_], rows_basis: Floats, columns_basis: Floats) -> Floats:
+def mask_moments(mask: Bools, rows_basis: Floats, columns_basis: Floats) -> Floats:
     """(d, d) sums over the pixels of a mask (h, w) of the products of polynomials (h, d) and (w, d)."""
     height, width = mask.shape
     rows = max(_MASK_BLOCK_BYTES // max(width, 1), 1)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from dm_calibration.calibration import Calibration
@@ -11,7 +10,7 @@ from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.quality import NO_RESPONSE
 from dm_calibration.influence.registration import bumps
 from dm_calibration.recalibration.drift import Displaced
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sampling import SamplePoints
@@ -35,7 +34,7 @@ TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 SURE = 0.9
 
 
-def without_response(calibration: Calibration) -> NDArray[np.bool_]:
+def without_response(calibration: Calibration) -> Bools:
     """(N,) which actuators showed no response in the calibration."""
     return np.isin(calibration.fit.grades, NO_RESPONSE)
 
@@ -65,7 +64,7 @@ def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats
 
 
 def displaced_actuators(
-    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: NDArray[np.bool_]
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: Bools
 ) -> dict[int, Displaced]:
     """Actuators whose displacement explains `innovation` (R,), found one by one by generalised least squares.
 
@@ -97,7 +96,7 @@ def displaced_actuators(
     return displaced
 
 
-def _probability(columns: Floats, power: Floats, white: Floats, silent: NDArray[np.bool_]) -> Floats:
+def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools) -> Floats:
     """(N,) probability that each actuator alone causes the difference `white` (R,), against any other cause.
 
     An actuator may be anywhere in its range. A cause other than an actuator changes all values, by an unknown amount
@@ -131,9 +130,7 @@ def displacement(
     return np.asarray(inverse @ white[:, -1]), np.sqrt(np.square(inverse).sum(axis=1))
 
 
-def described(
-    displaced: Mapping[int, Displaced], expected: Floats, given_up: NDArray[np.bool_], silent: NDArray[np.bool_]
-) -> str:
+def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bools, silent: Bools) -> str:
     """Describe what a disagreeing map shows, where actuators should stand at `expected` (N,).
 
     Args:

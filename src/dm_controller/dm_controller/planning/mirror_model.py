@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
@@ -111,7 +110,7 @@ class Plan:
     rms_upper: float
     max_zernike: float
     max_zernike_upper: float
-    saturated: NDArray[np.bool_]
+    saturated: Bools
     most: str = ""  # main source of the bound, where that is much more than the calibration's own error
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Bools
 from dm_common.values import parameter, text, whole
 from dm_driver.electronics.frame_format import FrameFormat
 
@@ -138,7 +139,7 @@ class DriveElectronics(ABC):
             raise LinkError(f"cannot open {self.where}: {reason}") from error
         self._open = True
 
-    def write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         """Set the outputs, all of them at once.
 
         Args:
@@ -179,7 +180,7 @@ class DriveElectronics(ABC):
     ) -> None:
         self.close()
 
-    def _check_codes(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _check_codes(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         if codes.shape != (self.channels,) or codes.dtype.kind != "u":
             raise CodeError(
                 f"codes: shape {codes.shape}, type {codes.dtype}; must be ({self.channels},) unsigned integers"
@@ -217,7 +218,7 @@ class DriveElectronics(ABC):
         """Open the link and keep it as `_link`, an object with a method `close`."""
 
     @abstractmethod
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         """Encode and send one frame."""
 
     @abstractmethod

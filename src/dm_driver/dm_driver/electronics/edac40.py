@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from serial.urlhandler import protocol_socket
 
+from dm_common import Bools
 from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings, LinkError
 from dm_driver.electronics.discovery import Probe
 
@@ -38,7 +39,7 @@ PHYSICAL_CHANNEL: Final[NDArray[np.intp]] = np.array(
 )
 
 
-def encode_frame(codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> bytes:
+def encode_frame(codes: NDArray[np.uint16], wired: Bools) -> bytes:
     """Return the frame that sets the `wired` channels to `codes`.
 
     Args:
@@ -108,7 +109,7 @@ class Edac40Tcp(_Edac40):
             options.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
             options.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, max(1, round(self._timeout_s * 1000)))
 
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         self._do_check()  # the first frame after the unit closed would be swallowed without an error
         if self._settings.doubt:
             self._await_arrival(codes)
@@ -182,7 +183,7 @@ class Edac40Udp(_Edac40):
                     f"no answer to discovery on UDP port {self._settings.discovery_port} within {self._timeout_s:g} s"
                 )
 
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         self._frame = encode_frame(codes, wired)
         self._repeats = _REPEATS
         self._link.send(self._frame)

@@ -7,6 +7,7 @@ import numpy as np
 import serial
 from numpy.typing import NDArray
 
+from dm_common import Bools
 from dm_driver.electronics.base import SERIAL_PORT, DriveElectronics, ElectronicsSettings, LinkError
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
@@ -55,7 +56,7 @@ class FramedSerial(DriveElectronics):
         if opening:
             self._link.write(opening)
 
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         pause = self._sent_at + 1.0 / self.frames_per_second - time.monotonic()
         if pause > 0.0:
             time.sleep(pause)

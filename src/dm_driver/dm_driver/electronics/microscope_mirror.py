@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Bools
 from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings, LinkError
 
 
@@ -46,7 +47,7 @@ class MicroscopeMirror(DriveElectronics):
         if actuators != self.channels:
             raise LinkError(f"has {actuators} actuators, mirror.actuators is {self.channels}")
 
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         self._asked(lambda: self._link.apply_pattern(codes / self.max_code))
 
     def _do_check(self) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import serial
 from numpy.typing import NDArray
 
+from dm_common import Bools
 from dm_driver.electronics.base import SERIAL_PORT, DriveElectronics
 
 CHANNELS: Final = 40
@@ -62,7 +63,7 @@ class UsbDac40(DriveElectronics):
         self._link = serial.Serial(self._settings.serial_port, timeout=0, write_timeout=self._timeout_s, exclusive=True)
         self._link.write(bytes(FRAME_LENGTH))  # ends any frame that an earlier program left half sent
 
-    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+    def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         self._link.write(encode_frame(codes))
 
     def _do_check(self) -> None:

@@ -14,6 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
+
 #: Fewer codes than this between signal -1 and +1 are taken for a mistake in the configuration.
 MIN_CODES = 100
 _CODE_SLACK = 1e-6
@@ -79,12 +81,12 @@ class VoltScale:
                 f" {self.amplifier_gain:g}"
             )
 
-    def volts(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
+    def volts(self, signals: Floats) -> Floats:
         """Actuator volts of normalised signals."""
         low, span = self._powers
         return np.asarray((low + (signals + 1.0) * (0.5 * span)) ** (1.0 / LAWS[self.law]), dtype=np.float64)
 
-    def codes(self, signals: NDArray[np.float64]) -> NDArray[np.uint16]:
+    def codes(self, signals: Floats) -> NDArray[np.uint16]:
         """Nearest codes of normalised signals; never one whose voltage lies outside volts_min..volts_max.
 
         Raises:
@@ -94,17 +96,17 @@ class VoltScale:
             raise ValueError(f"signals = {signals}: must be finite and in -1 to 1")
         return np.clip(np.rint(self.exact_codes(signals)), *self._code_range).astype(np.uint16)
 
-    def exact_codes(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
+    def exact_codes(self, signals: Floats) -> Floats:
         """Codes of normalised signals, not rounded."""
         dac_volts = self.volts(signals) / self.amplifier_gain
         return np.asarray((dac_volts - self.dac_volts_at_zero) * (self.max_code / self._dac_span), dtype=np.float64)
 
-    def signals_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
+    def signals_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> Floats:
         """Normalised signals at the actuators for these codes."""
         low, span = self._powers
         return np.asarray((self.volts_of_codes(codes) ** LAWS[self.law] - low) * (2.0 / span) - 1.0, dtype=np.float64)
 
-    def volts_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> NDArray[np.float64]:
+    def volts_of_codes(self, codes: NDArray[np.uint16 | np.float64]) -> Floats:
         """Actuator volts for these codes."""
         dac_volts = self.dac_volts_at_zero + codes * (self._dac_span / self.max_code)
         return np.asarray(dac_volts * self.amplifier_gain, dtype=np.float64)

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Bools, Floats
 from dm_driver.output.volts import VoltScale
 from dm_driver.safety_limiter import Shape
 
@@ -80,9 +81,9 @@ class OutputStage:
     def __init__(self, scale: VoltScale, channel_of_actuator: NDArray[np.intp], channels: int) -> None:
         self.scale = scale
         #: (N,) True where the actuator has a channel.
-        self.connected: NDArray[np.bool_] = channel_of_actuator != NOT_WIRED
+        self.connected: Bools = channel_of_actuator != NOT_WIRED
         #: (channels,) True where an actuator is connected.
-        self.wired: NDArray[np.bool_] = np.zeros(channels, dtype=np.bool_)
+        self.wired: Bools = np.zeros(channels, dtype=np.bool_)
         #: (N,) connector channel of each actuator, `NOT_WIRED` for those without one.
         self.channels = channel_of_actuator
         self.wired[channel_of_actuator[self.connected]] = True
@@ -95,7 +96,7 @@ class OutputStage:
         codes[self.channels[self.connected]] = self.scale.codes(shape)[self.connected]
         return codes
 
-    def outcome(self, codes: NDArray[np.uint16]) -> tuple[Shape, NDArray[np.float64]]:
+    def outcome(self, codes: NDArray[np.uint16]) -> tuple[Shape, Floats]:
         """(N,) signals and (N,) V at the actuators for these codes; an actuator without a channel rests at -1."""
         of_actuator = np.where(self.connected, codes[self.channels], self._rest[0])
         return self.scale.signals_of_codes(of_actuator), self.scale.volts_of_codes(of_actuator)

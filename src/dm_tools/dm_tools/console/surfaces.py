@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from dm_common import Floats
+from dm_common import Bools, Floats
 from dm_common.optics.piston_tilt import remove_plane
 from dm_controller.planning.active_calibration import model_of
 
@@ -24,7 +24,7 @@ RADIUS_TOLERANCE = 0.02
 
 
 @lru_cache(maxsize=1)
-def _disc() -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _disc() -> tuple[Floats, Floats, Bools]:
     """x and y of the grid in units of the radius, row 0 = top, and which points are shown."""
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, GRID), np.linspace(1.0, -1.0, GRID))
     return x, y, x**2 + y**2 <= SHOWN**2

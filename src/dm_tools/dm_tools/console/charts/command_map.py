@@ -7,10 +7,10 @@ from functools import lru_cache
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
-from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
 from dm_calibration.report.document import VERMILION
+from dm_common import Floats
 from dm_tools.console.charts.plots import INK, Drawing, chart
 from dm_tools.console.view_models import SIGNAL_COLOURS, Cell, ink_on
 
@@ -98,7 +98,7 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
 
 
 @lru_cache(maxsize=8)
-def outlines(places: tuple[tuple[float, float], ...]) -> list[tuple[NDArray[np.float64], float]]:
+def outlines(places: tuple[tuple[float, float], ...]) -> list[tuple[Floats, float]]:
     """For each actuator the corners (K, 2) of its cell in order, and the distance from its centre to the nearest side.
 
     Each cell is a regular hexagon with one side facing the nearest other actuator, half way towards it. It is clipped

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from matplotlib.image import imsave
-from numpy.typing import NDArray
 
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION
+from dm_common import Floats
 from dm_tools.console.loops import Loop
 from dm_tools.console.surfaces import Surface
 from dm_tools.console.view_models import Bar
@@ -109,7 +109,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
     )
 
 
-def _image(values: NDArray[np.float64], colours: str) -> str:
+def _image(values: Floats, colours: str) -> str:
     """The values -1 .. +1 in colours, as the data URL of a PNG picture; NaN is transparent."""
     rgba = colormaps[colours](np.clip(0.5 + 0.5 * np.nan_to_num(values), 0.0, 1.0), bytes=True)
     rgba[..., 3] = np.where(np.isfinite(values), 255, 0)
