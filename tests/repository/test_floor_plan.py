@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from studies.house_figures import WALKED, printed_by
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = sorted(path.name for path in (ROOT / "src").iterdir() if (path / path.name / "__init__.py").is_file())
 #: Folders beside the installed packages, by the name under which they are imported.
@@ -25,6 +27,8 @@ SMALL_MODULE_LINES = 40
 #: Modules of this project that the focus controller's node may load at its start, __init__ counted too; what a request
 #: or an action imports later is not among them.
 NODE_MODULES_MAX = 45
+#: Modules that a request passes from the callback of its topic to the command that is published.
+WALK_MODULES_MAX = 8
 
 
 def name_of(path: Path, home: str) -> str:
@@ -95,6 +99,13 @@ def test_the_focus_controller_is_on_its_own() -> None:
     output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     started = [name for name in output.split() if name in MODULES]
     assert 0 < len(started) <= NODE_MODULES_MAX, sorted(started)
+
+
+@pytest.mark.slow
+def test_a_request_passes_few_modules_on_its_way_to_the_mirror() -> None:
+    files = printed_by(WALKED, str(ROOT))["files"]
+    assert "dm_controller/dm_controller/planning/planner.py" in files
+    assert len(files) <= WALK_MODULES_MAX, files
 
 
 @pytest.mark.slow

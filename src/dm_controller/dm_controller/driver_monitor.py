@@ -48,6 +48,7 @@ class DriverMonitor:
         order: the order whose shape was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
         starts: number of times the driver was activated anew, as far as reports show.
+        open_until: s, until when the driver is taken to accept commands of anybody; after that, ask `check`.
         gone: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
@@ -56,6 +57,7 @@ class DriverMonitor:
         self.order: Order | None = None
         self.latest: ActuatorState | None = None
         self.starts = 0
+        self.open_until = -math.inf
         self.gone = ""
         self._heard = 0.0
         # s: this clock minus the steady one, and how far stamps are ahead of each; infinite until known: no gain.
@@ -85,12 +87,18 @@ class DriverMonitor:
         commands = [each for each in (order.command, order.earlier) if each is not None]
         return order if any(same_signals(report.requested, each.signals) for each in commands) else None
 
+    def lost(self, reason: str) -> None:
+        """Note what happened to a driver that is known to be dead, as a sentence; "" = it may live."""
+        self.gone = reason
+        self._trust()  # a parameter may have changed, too
+
     def observe(self, report: ActuatorState, now: float) -> bool:
         """Take the driver's next report; returns True if it is the first to make the latency known."""
         before, self.latest, self._heard = self.latest, report, now
         self.gone = ""  # a driver that reports is alive
         anew = before is not None and report.sequence < before.sequence
         self.starts += anew
+        self._trust()
         command = self.order.command if self.order is not None else None
         if command is None or command.confirmed:
             return False
@@ -116,6 +124,11 @@ class DriverMonitor:
             self._ahead = ahead, ahead + drift
         self._drift, self._stamp = drift, stamp
         return gain if gain > CLOCK_JUMP_S and not now.simulated else 0.0
+
+    def _trust(self) -> None:
+        report, limit = self.latest, self._values["driver_timeout"] or math.inf
+        is_open = report is not None and report.driver_state == ActuatorState.STATE_ACTIVE and not report.holder
+        self.open_until = self._heard + limit if is_open and not self.gone else -math.inf
 
     def silent(self, now: float) -> str:
         """Why the driver counts as silent, as a sentence; "" = it reports, or never did."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from copy import copy
 from typing import Any
 
@@ -49,20 +49,13 @@ class FocusHost(ManagedNode, ABC):
         MoveFocusAction(self, self._values)
         self.calibration_node = qos.watch(self, "calibration", Calibration, "calibration", qos.LATCHED)
 
-    @contextmanager
-    def controller(self) -> Iterator[tuple[FocusController, Moment]]:
+    @abstractmethod
+    def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
         """The controller, locked for one thread at a time, and the present time."""
-        with self._lock:
-            clock = self.get_clock()
-            ns = int(clock.now().nanoseconds)
-            yield self._controller, Moment(ns, 1e-9 * ns, time.monotonic(), clock.ros_time_is_active)
 
+    @abstractmethod
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
         """Judge a request and, unless it is refused or a dry run, carry it out."""
-        with self.controller() as (controller, now):
-            order, effects = controller.request(message, now, dry_run)
-            self.carry_out(effects, now)
-        return order
 
     @abstractmethod
     def carry_out(self, effects: Iterable[Effect], now: Moment) -> None:

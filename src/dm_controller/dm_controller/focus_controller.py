@@ -193,7 +193,8 @@ class FocusController:
             if not dry_run:
                 if now.simulated and not now.ns:  # creep would take the clock's jump for time at this shape
                     raise Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
-                self.monitor.check(order.request, now.steady)
+                if now.steady > self.monitor.open_until:
+                    self.monitor.check(order.request, now.steady)
                 at_once = degaussed is not None or (move.degauss is None and self.conditioning.run is None)
                 effects += (self._go if at_once else self._condition)(order, move, now)
         except Refusal as refusal:
@@ -268,7 +269,7 @@ class FocusController:
 
         `driver_gone`: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
         """
-        self.monitor.gone = driver_gone
+        self.monitor.lost(driver_gone)
         effects: list[Effect] = []
         if failure := self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady):
             effects += self._degauss_ended(now, failure)

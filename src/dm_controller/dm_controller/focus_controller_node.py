@@ -4,7 +4,9 @@ Translates messages, parameters and time; what happens is decided in `dm_control
 """
 
 import sys
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -27,7 +29,7 @@ from dm_common.ros import qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import frame_id
 from dm_controller.focus_actions import FocusHost
-from dm_controller.focus_controller import SLOW_PERIOD_S
+from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import actuator_estimate_message, capabilities_message, state_message
 from dm_controller.focus_types import (
     Effect,
@@ -93,6 +95,13 @@ class FocusControllerNode(FocusHost):
                 self.carry_out(controller.use(self._calibration, self._mirror, self._recipes), now)
                 self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
+    @contextmanager
+    def controller(self) -> Iterator[tuple[FocusController, Moment]]:
+        with self._lock:
+            clock = self.get_clock()
+            ns = int(clock.now().nanoseconds)
+            yield self._controller, Moment(ns, 1e-9 * ns, time.monotonic(), clock.ros_time_is_active)
+
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
         with self.controller() as (_controller, now):
@@ -133,6 +142,12 @@ class FocusControllerNode(FocusHost):
             gone = f"pdm_driver {qos.GONE}" if self._driver.missing() else ""
             self.carry_out(controller.tick(now, gone), now)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
+
+    def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
+        with self.controller() as (controller, now):
+            order, effects = controller.request(message, now, dry_run)
+            self.carry_out(effects, now)
+        return order
 
     def carry_out(self, effects: Iterable[Effect], now: Moment) -> None:
         for effect in effects:

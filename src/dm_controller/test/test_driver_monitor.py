@@ -143,7 +143,7 @@ def test_the_latency_is_from_the_command_to_its_first_write() -> None:
 
 def test_who_reports_after_a_lease_lapsed_is_not_dead() -> None:
     driver = monitor()
-    driver.gone = "pdm_driver has died"
+    driver.lost("pdm_driver has died")
     assert driver.silent(BEGAN + 0.5) == "pdm_driver has died"
     driver.observe(report(), BEGAN + 1.0)
     assert driver.silent(BEGAN + 1.5) == ""
