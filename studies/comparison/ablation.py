@@ -14,12 +14,13 @@ import numpy as np
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.procedure import Progress
+from dm_common import Floats
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.ablation_figures import Ablation, Identified, Requests, Series
 from studies.comparison.ablation_models import MODELS, Variant, make_variants
 from studies.comparison.driven_mirror import DrivenMirror
 from studies.comparison.random_requests import CURVATURE_MAX, DWELLS
-from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, plan_steps
 from studies.comparison.true_surface import TrueSurface
 
 #: What precedes the requests. Tracked: everything that the calibration did, and no degauss. Power cycle: power off for

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dm_common import Floats
 from studies.comparison.compare import peak_to_valley
-from studies.comparison.simulated_bench import Floats
 
 
 @dataclass(frozen=True, eq=False)

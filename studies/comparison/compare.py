@@ -25,6 +25,7 @@ from dm_calibration.influence.maps import StepKind
 from dm_calibration.influence.region_weighting import choose_weighting
 from dm_calibration.influence.regression import make_design, regress
 from dm_calibration.procedure.procedure import Progress
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
@@ -33,7 +34,7 @@ from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import PseudoInverse
 from dm_tools.verify import SurfaceError, surface_error
-from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, influence_model, plan_steps
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model, plan_steps
 from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver
 from studies.solvers.steepest_descent import SteepestDescent
 

@@ -13,13 +13,14 @@ from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, Step, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
+from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_common.mirror import Mirror
 from studies.comparison.drawn_mirrors import draw_mirror
 from studies.comparison.driven_mirror import DrivenMirror
 from studies.comparison.population import held_for_a_day
 from studies.comparison.random_requests import Requests, active_of, draw_targets, judge_requests
-from studies.comparison.simulated_bench import Floats, SimulatedBench
+from studies.comparison.simulated_bench import SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
 #: Plans: random shapes to identify hysteresis, patterns of all actuators, one actuator at a time.

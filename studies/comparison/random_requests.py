@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from dm_msgs.msg import Calibration, MirrorInfo
 
+from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_common.messages import doubles
 from dm_common.optics.zernike import PISTON_TILT, TERMS
@@ -16,7 +17,7 @@ from dm_controller.planning.active_calibration import ActiveCalibration, active_
 from dm_controller.planning.choice import unreachable
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.driven_mirror import DrivenMirror
-from studies.comparison.simulated_bench import Floats, SimulatedBench
+from studies.comparison.simulated_bench import SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
 #: Parameter reachable_tolerance as shipped, m.

@@ -29,13 +29,14 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibrator import fit_effective
 from dm_calibration.influence.fit import FitOptions
+from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
 from dm_controller.planning.mirror_model import InfluenceModel, response, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
+from dm_controller.solvers.base import Shape, Solver, measured_shape, rms_sag
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 from studies.paper.hysteresis_control import HysteresisControl
 from studies.paper.regressions import fit_of

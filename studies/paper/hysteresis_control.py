@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_controller.planning.mirror_model import CalibratedMirror, response
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.solvers.base import MISS, Floats, Shape, Solver, measured_shape
+from dm_controller.solvers.base import MISS, Shape, Solver, measured_shape
 from studies.comparison.simulated_bench import SimulatedBench
 from studies.paper.samples import Samples
 

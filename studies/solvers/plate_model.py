@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import Floats, Shape, Solver, normalised_terms, points_of
+from dm_controller.solvers.base import Shape, Solver, normalised_terms, points_of
 from dm_controller.solvers.least_squares import CUTOFF
 
 

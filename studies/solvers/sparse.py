@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linprog
 
+from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Command, Shape, Solver, normalised_terms
 
 #: Cost of a unit of coefficient error (in units of the strongest pattern) relative to a unit of θ. An L1 penalty is
 #: exact: above a certain price the coefficients are met exactly whenever the limits permit.

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Command, Shape, Solver, normalised_terms
 
 #: Iterations on the model in an open-loop solve: with the condition number of such mirrors (10 to 13) the error of the
 #: worst mode falls by 2 % per iteration.

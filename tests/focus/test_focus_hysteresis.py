@@ -18,8 +18,9 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
+from dm_common.atomic_write import state_file
 from dm_common.errors import Refusal
-from dm_common.hysteresis.creep_record import CreepRecord, record_file, write_record
+from dm_common.hysteresis.creep_record import CreepRecord, write_record
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.active_calibration import active_calibration
 from focus_bench import HysteresisBench, calibration_with_history, make_law, mirror_info, recipe, recipe_book
@@ -71,7 +72,7 @@ def test_unknown_history_is_told_and_cured_by_a_degauss(
 ) -> None:
     # What was held before, the node finds on disk: nothing.
     monkeypatch.setenv("ROS_HOME", str(tmp_path))
-    file = record_file("~/.ros/focus_controller", mirror_info().serial)
+    file = state_file("~/.ros/focus_controller", ".creep.npz", mirror_info().serial)
     assert file is not None
     write_record(file, CreepRecord(time.time() - 1.0, CREEP_TIMES, np.zeros((37, 15)), np.zeros(15), np.zeros((37, 0))))
     bench = make(observer, start, law=STILL)

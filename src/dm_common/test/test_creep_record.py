@@ -16,7 +16,6 @@ from dm_common.hysteresis.creep_record import (
     CreepRecord,
     CreepRecorder,
     read_record,
-    record_file,
     record_of,
     rested,
     write_record,
@@ -244,14 +243,6 @@ def test_a_calibration_made_since_counts_for_more_than_a_record() -> None:
         assert rested(law, np.zeros(3), 60.0, 0.0, record).crept[0, -1] == pytest.approx(-0.6, abs=1e-3)
     later = AT_REST._replace(time=55.0)
     assert rested(law, np.zeros(3), 60.0, 0.0, later).crept[0, -1] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_HOME", "/var/ros")
-    assert record_file("", "a") is None
-    assert record_file("~/.ros/focus_controller", "PDM 30/1") == Path("/var/ros/focus_controller/PDM-30-1.creep.npz")
-    assert record_file("/srv", "..") == Path("/srv/mirror.creep.npz")
-    assert record_file("~/.ros_bench", "a") == Path("~/.ros_bench/a.creep.npz").expanduser()
 
 
 def test_another_mirror_begins_with_its_own_record_and_no_reports(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ what a killed process wrote; only a crash of the whole computer may lose the las
 import fcntl
 import logging
 import os
-import re
 import struct
 import zlib
 from pathlib import Path
@@ -112,11 +111,3 @@ class LastShape:
         if magic != _MAGIC or actuators != self._actuators:
             return 0, None
         return number, np.frombuffer(slot, "<f8", actuators, _HEAD.size).copy()
-
-
-def record_path(folder: str, *names: object) -> Path | None:
-    """The file in `folder` for the unit and mirror that `names` identify; None for an empty folder name."""
-    if not folder:
-        return None
-    stem = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", str(name)).strip("-.") for name in names)
-    return Path(folder).expanduser() / f"{stem[:200]}.shape"

@@ -14,6 +14,7 @@ from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
 
+from dm_common.atomic_write import state_file
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_common.ros import parameters, qos
@@ -29,7 +30,7 @@ from dm_driver.driver_configuration import DriverConfiguration, build_configurat
 from dm_driver.driver_health import LinkLog, driver_health
 from dm_driver.driver_messages import mirror_info_message, state_message, unconfigured_message
 from dm_driver.driver_parameters import PARAMETERS
-from dm_driver.last_shape import LastShape, record_path
+from dm_driver.last_shape import LastShape
 from dm_driver.moves import Move, Outcome, WriterState
 
 #: Shortest time between two state messages in the middle of a ramp, s.
@@ -105,7 +106,7 @@ class PdmDriverNode(ManagedNode):
         settings, actuators = configuration.settings, configuration.limiter.limits.actuators
         place = settings.serial_port or f"{settings.address}-{settings.port}"
         names = self._values["electronics.kind"], place, self._values["mirror.serial"]
-        path = record_path(self._values["state_folder"], *names)
+        path = state_file(self._values["state_folder"], ".shape", *names)
         try:
             return LastShape(path, actuators)
         except OSError as error:

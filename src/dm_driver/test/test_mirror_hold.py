@@ -132,6 +132,7 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
         (ErrorCode.INVALID_ARGUMENT, {"holder": " "}),
         (ErrorCode.NOT_FINITE, {"lease": float("nan")}),
         (ErrorCode.OUT_OF_RANGE, {"lease": -1.0}),
+        (ErrorCode.OUT_OF_RANGE, {"lease": 1e-9}),
         (ErrorCode.NOT_FINITE, {"duration": float("inf")}),
         (ErrorCode.OUT_OF_RANGE, {"duration": 2e9}),
         (ErrorCode.INVALID_LENGTH, {"holder": "x" * 5000}),

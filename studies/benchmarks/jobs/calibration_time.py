@@ -9,8 +9,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_common import Floats
 from studies.benchmarks.timing import Effort
-from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 
 class TimedBench(SimulatedBench):

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.search.defocus_model import TRANSFER_ERROR_NEAR, DefocusModel, Floats
+from dm_autofocus.search.defocus_model import TRANSFER_ERROR_NEAR, DefocusModel
 from dm_autofocus.search.peak_search import Peak, SearchConfig, Step
+from dm_common import Floats
 from dm_common.values import parameter, real, whole
 
 #: Share by which the normal sharpness follows each image.

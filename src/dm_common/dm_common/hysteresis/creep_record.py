@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -44,16 +42,6 @@ class CreepRecord(NamedTuple):
     crept: Floats
     crept_sigma: Floats
     lagged: Floats
-
-
-def record_file(folder: str, serial: str) -> Path | None:
-    """The file of a mirror in `folder`, where ~/.ros is $ROS_HOME if that is set; None for an empty folder name."""
-    if not folder:
-        return None
-    stem = re.sub(r"[^A-Za-z0-9.-]+", "-", serial).strip("-.")[:200] or "mirror"
-    place, home, usual = Path(folder), os.environ.get("ROS_HOME"), Path("~/.ros")
-    place = home / place.relative_to(usual) if home and place.is_relative_to(usual) else place
-    return place.expanduser() / f"{stem}.creep.npz"
 
 
 def write_record(file: Path, record: CreepRecord) -> None:
@@ -160,7 +148,7 @@ class CreepRecorder:
         if serial == self._serial:
             return
         another, self._serial = self._serial is not None, serial
-        file, record = record_file(self.folder, serial), None
+        file, record = self._file(serial), None
         try:
             record = read_record(file, now) if file is not None else None
         except ValueError as error:
@@ -175,10 +163,15 @@ class CreepRecorder:
         latest = self._observer.latest
         if self._serial is None or latest is None or not latest.linked:
             return
-        file = record_file(self.folder, self._serial)
+        file = self._file(self._serial)
         record = record_of(self._observer.law, self._observer.state, now)
         if file is not None and record is not None:
             self._disk.submit(self._write, file, record)
+
+    def _file(self, serial: str) -> Path | None:
+        from dm_common.atomic_write import state_file  # not imported at start, to save time
+
+        return state_file(self.folder, ".creep.npz", serial)
 
     def _write(self, file: Path, record: CreepRecord) -> None:
         try:

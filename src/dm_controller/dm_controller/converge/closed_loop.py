@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dm_common import Floats
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
@@ -29,7 +30,7 @@ from dm_common.measurement import Bench
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
+from dm_controller.solvers.base import Shape, Solver, measured_shape, rms_sag
 
 #: Bounds of the factor by which the observed response may scale a correction.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5

@@ -9,10 +9,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.recipes import Kriging
-from dm_controller.solvers.base import Floats, Shape
+from dm_controller.solvers.base import Shape
 
 #: Lower bound of the standard deviation of a mean of maps, m.
 SIGMA_MIN = 1e-12

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dm_common import Floats
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Bench
@@ -22,7 +23,7 @@ from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError, target_of
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag
+from dm_controller.solvers.base import Shape, measured_shape, rms_sag
 
 #: Deviation of an effective signal, where a limit binds, up to which a recipe keeps the effective signals aimed at.
 MISS_IGNORED = 1e-3

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt
@@ -10,7 +11,7 @@ from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel, reduced
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, normalised_terms, points_of
+from dm_controller.solvers.base import Command, Shape, Solver, miss_rows, normalised_terms, points_of
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3

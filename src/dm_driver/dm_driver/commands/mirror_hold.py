@@ -15,8 +15,8 @@ from dm_common.values import real, text
 
 #: A hold that is not renewed ends after this time, s, unless its holder asked for another lease.
 LEASE_S = 3.0
-#: Longest lease that may be asked for, s.
-LEASE_MAX_S = 3600.0
+#: Shortest and longest lease that may be asked for, s.
+LEASE_MIN_S, LEASE_MAX_S = 0.1, 3600.0
 #: Number of holders that are remembered after their hold was taken over.
 EVICTED_KEPT = 100
 
@@ -24,7 +24,7 @@ EVICTED_KEPT = 100
 Operation = HoldMirror.Request
 _OPERATION = text("", choices=("", Operation.HOLD, Operation.RENEW, Operation.TAKE_OVER, Operation.RELEASE))
 _DURATION = real(0.0, 0.0, 1e9, "s")
-_LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
+_LEASE = real(0.0, LEASE_MIN_S, LEASE_MAX_S, "s", zero=f"{LEASE_S:g} s, or in a renewal as before")
 #: Constraints on `holder` and `purpose`, which appear in every refusal and state.
 TEXT = text("")
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_bringup.suite import Config, Suite, load_config
+from dm_common.atomic_write import ros_home
 from dm_tools.output import checked_namespace, console, next_step
 from dm_tools.running_suite import calibration_refused, unknown_history
 
@@ -123,7 +124,7 @@ def up(
 def only_suite(namespace: str) -> Iterator[None]:
     """Lock this ROS domain and namespace for one suite. Raises RuntimeError when another suite has the lock."""
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    folder = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
+    folder = ros_home()
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"dm_up.{domain}.{namespace.replace('/', '.')}").open("a+") as place:
         try:
