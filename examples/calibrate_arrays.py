@@ -10,6 +10,7 @@ import numpy as np
 from dm_calibration import calibrate
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.hysteresis.features import follow
+from dm_common.hysteresis.creep_record import rested
 from dm_common.mirror import Mirror
 
 run = np.load(sys.argv[1])
@@ -20,6 +21,7 @@ calibration = calibrate(
     run["sag"],  # (maps, height, width) m, NaN = no data; a map may be all NaN
     run["commands"],  # (maps, actuators) normalised signals, from a degauss on
     run["times"],  # (maps,) s
+    moved=run.get("moved"),  # (maps,) s, when the mirror took each shape; None = right after the map before
     mirror=mirror,
     settings=settings,
     hysteresis=True,
@@ -28,8 +30,10 @@ known = calibration.hysteresis
 print(f"{known.name}: coefficients right to {known.held_out_max_zernike * 1e9:.2f} nm on moves held out (95 %)")
 
 # What the model says of the run: effective signals, and the Zernike coefficients that follow from them.
-rest = known.law.demagnetised(mirror.actuators, run["times"][0] - 1.0)
-effective, _ = follow(known.law, rest, run["commands"], run["times"])
+maps = calibration.maps
+start = rested(known.law, np.zeros(mirror.actuators), known.law.crept_at)  # with what it had crept to before the run
+times, moved = 1e-9 * maps.stamp_ns, maps.moved_s() + 1e-9 * maps.stamp_ns[0]
+effective, _ = follow(known.law, start, maps.applied, times, moved)
 predicted = calibration.fit.zernike_offset + effective @ calibration.fit.influence_zernike.T
-left = (calibration.maps.coefficients - predicted)[:, 3:]  # without piston and tilt
+left = (maps.coefficients - predicted)[:, 3:]  # without piston and tilt
 print(f"the run again: {np.sqrt(np.nanmean(left**2)) * 1e9:.2f} nm rms in the coefficients")

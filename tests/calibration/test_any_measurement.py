@@ -120,6 +120,16 @@ def test_what_is_refused() -> None:
         bad = np.where((np.arange(160) == 6).reshape(-1, *[1] * (array.ndim - 1)), np.nan, array)
         with pytest.raises(ValueError, match=text):
             identify_response(bad, measured, times) if array is commands else identify_response(commands, measured, bad)
+    with pytest.raises(ValueError, match=r"times go up to 1\.7e\+18: must be s, not ns"):
+        identify_response(commands, measured, 1e9 * times + 1.7e18)
+    with pytest.raises(ValueError, match=r"moved: must be \(160,\) s, each between the measurement before and its own"):
+        identify_response(commands, measured, times, moved=times + 0.1)
+    with pytest.raises(ValueError, match="do not tell the actuators 3, 5 apart"):
+        identify_response(np.where(np.arange(19) == 4, commands[:, 2:3], commands), measured, times)
+    with pytest.raises(ValueError, match="candidates: must be at least one law"):
+        identify_response(commands, measured, times, candidates=())
+    with pytest.raises(ValueError, match=r"measured reaches 1e\+300: too large"):
+        identify_response(commands, np.where(measured > measured.mean(), 1e300, -1e300), times)
     with pytest.raises(ValueError, match="nothing in it changes"):
         identify_response(commands, np.ones_like(measured), times)
     found = identify_response(commands, measured, times, candidates=STATIC[:1])

@@ -166,6 +166,15 @@ def test_a_degauss_in_the_course_of_a_run_wipes_its_loops_and_not_its_creep() ->
     assert np.abs(expected[20]).max() > 1e-3  # creep of what stood before
 
 
+def test_a_figure_that_drifts_is_named() -> None:
+    assert not any("drifted" in remark for remark in fitted().remarks)
+    maps = run()
+    drift = np.zeros_like(maps.coefficients)
+    drift[:, 5] = np.linspace(0.0, 100e-9, len(maps))
+    found = plays(replace(maps, coefficients=maps.coefficients + drift))
+    assert any("the figure drifted by more than earlier creep explains" in remark for remark in found.remarks)
+
+
 def test_a_map_of_something_else_does_not_enter_the_law() -> None:
     maps, spoilt = run(), np.array(run().coefficients)
     row = maps.label.index("excitation 50")

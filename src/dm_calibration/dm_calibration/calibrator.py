@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import IngestSettings
-from dm_calibration.acquisition.map_sources import Maps, outcome_of
+from dm_calibration.acquisition.map_sources import Maps, outcome_of, unix_times
 from dm_calibration.calibration import Calibration, software_version
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
@@ -53,6 +53,7 @@ def calibrate(
     commands: ArrayLike | None = None,
     times: ArrayLike | None = None,
     *,
+    moved: ArrayLike | None = None,
     mirror: Mirror,
     options: FitOptions | None = None,
     settings: IngestSettings | None = None,
@@ -76,7 +77,11 @@ def calibrate(
     commands : array_like (M, N)
         Normalised signals applied to the mirror, one row for each map.
     times : array_like (M,), optional
-        When the maps were taken, s; by default as given in the files. Required for hysteresis.
+        When the maps were taken, s, Unix time or from any start: then the last map counts as taken now. By default as
+        given in the files, some of which have whole seconds only. Required for hysteresis.
+    moved : array_like (M,), optional
+        When the mirror took each shape, on the clock of ``times``; by default right after the map before. Give it where
+        saving a map or anything else came between: without it creep is found wrong, and held-out errors do not show it.
     mirror
         Positions of the actuators, working aperture and limits.
     options
@@ -106,14 +111,16 @@ def calibrate(
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError
         Commands or times that do not match the maps, commands that are not normalised, or, where hysteresis is to be
-        identified, times that are missing, all the same or run backwards.
+        identified, times that are missing, the same for maps of two commands, or run backwards.
     """
     if isinstance(maps, Outcome):
         outcome = maps
     elif commands is None:
         raise ValueError("commands: must be given, (M, N) signals, one row for each map")
     else:
-        outcome = outcome_of(maps, commands, times, mirror, settings, hysteresis)
+        if times is not None:
+            times, moved = unix_times(times, moved)
+        outcome = outcome_of(maps, commands, times, mirror, settings, hysteresis, moved)
     if provenance is None:
         now = time.time_ns()
         provenance = Provenance(new_id(mirror.name, mirror.serial, now), now)
@@ -130,6 +137,8 @@ def calibrate(
     wavelength = outcome.setup.wavelength if outcome.setup else 0.0
     if wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
+    if found and commands is not None and times is None and not (measured.stamp_ns % 10**9).any():
+        limitations.append("Times of the maps are whole seconds: creep of the first seconds is not well known.")
     if (parts := np.unique(measured.segment).size) > 1:
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
     limitations += [f"Poke check: {finding}." for finding in check.findings]

@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,17 @@ def test_a_folder_of_maps_whose_names_end_in_capitals(tmp_path: Path) -> None:
         outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS), True)
 
 
+def test_maps_whose_names_count_without_zeros(tmp_path: Path) -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)[:11]
+    for number, sag in enumerate(seen(plant, inside, commands)):
+        counts = np.where(inside, np.rint(sag / COUNT), NO_DATA).astype(np.int64)
+        (tmp_path / f"m{number}.dat").write_bytes(dat_bytes(counts, pitch=PITCH, time=1_700_000_000 + 5 * number))
+    outcome = outcome_of(tmp_path, commands, None, mirror)
+    assert [Path(record.file).name for record in outcome.records] == [f"m{number}.dat" for number in range(11)]
+
+
 def test_a_file_without_data_in_a_folder_wants_the_times(tmp_path: Path) -> None:
     mirror = make_mirror(rings=1)
     plant, inside = plant_on_pixels(mirror)
@@ -160,18 +172,22 @@ def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("pause", [0.0, 0.8])
 def test_arrays_of_commands_times_and_maps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], pause: float
 ) -> None:
+    """`pause`: s between a map and the next command, in which a bench saves the map."""
     mirror = make_mirror(rings=1)
     plant, inside = plant_on_pixels(mirror)
     weight = np.array([[0.7], [0.2], [0.1]])
     law = HysteresisModel(np.array([0.0, 0.225, 0.475]), weight, np.zeros(0), 0.0, 0.01, CREEP_TIMES)
     moves = excitation(mirror, 80)
-    times = np.cumsum(1.0 + moves.dwell)
-    effective, _ = follow(law, law.demagnetised(mirror.actuators, 0.0), moves.signals, times)
+    times = np.cumsum(1.0 + moves.dwell + pause)
+    moved = np.concatenate(([0.0], times[:-1])) + pause
+    effective, _ = follow(law, law.demagnetised(mirror.actuators, 0.0), moves.signals, times, moved)
     sag = seen(plant, inside, effective)
     sag[[0, 7]] = np.nan  # their commands count all the same
+    told: dict[str, Any] = {"moved": moved} if pause else {}
     file = tmp_path / "run.npz"
     np.savez(
         file,
@@ -182,10 +198,13 @@ def test_arrays_of_commands_times_and_maps(
         commands=moves.signals,
         times=times,
         sag=sag,
+        **told,
     )
     # Its actuators are alike; laws of each by itself would take most of the time.
     monkeypatch.setattr(calibrator, "fit_hysteresis", partial(fit_hysteresis, candidates=COMMON))
     made = run_example("calibrate_arrays.py", file, monkeypatch)
+    last = made["calibration"].maps.stamp_ns[-1]  # type: ignore[attr-defined]
+    assert abs(last - time.time_ns()) < 600e9, "times that count from the start of the run date it to the present"
     left_out = [text[:25] for text in made["calibration"].dropped]  # type: ignore[attr-defined]
     assert left_out == ["map 1: 0 valid pixels ins", "map 8: 0 valid pixels ins"]
     known = made["calibration"].hysteresis  # type: ignore[attr-defined]
@@ -226,6 +245,15 @@ def test_measurements_and_what_is_refused() -> None:
         calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
     with pytest.raises(ValueError, match="times: all are the same"):
         calibrate(sag, commands, np.zeros(len(sag)), mirror=mirror, settings=settings, hysteresis=True)
+    times = np.arange(len(sag), dtype=float)
+    twice = np.where(times == 2.0, 1.0, times)
+    with pytest.raises(ValueError, match="times: maps 2 and 3 have the same, but not the same command"):
+        calibrate(sag, commands, twice, mirror=mirror, settings=settings, hysteresis=True)
+    with pytest.raises(ValueError, match=r"moved has the shape \(2,\): must be"):
+        calibrate(sag, commands, times, moved=[0.0, 1.0], mirror=mirror, settings=settings)
+    for moved in (times + 0.1, times - 1.1, np.nan * times):
+        with pytest.raises(ValueError, match=r"moved: number [12] is .* must lie between the map before"):
+            calibrate(sag, commands, times, moved=moved, mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match="commands reach 75: must be normalised to -1 to 1"):
         calibrate(sag, 150.0 * commands, mirror=mirror, settings=settings)
     gap = np.where(np.arange(len(sag))[:, None] == 3, np.nan, commands)

@@ -173,6 +173,8 @@ def test_what_blurs_all_actuators_is_no_fault_of_one() -> None:
     assert "known to 15 % only" in quality.blur(response, error, excited, 10.0)[0].replace("15%", "15 %")
     assert not quality.blur(response, 0.1 * error, excited, 10.0)
     error[3] = 0.32
+    silent = quality.grade(np.zeros(37), np.zeros(37), excited, None, options)
+    assert (silent == quality.GRADE_DEAD).all(), "maps of nothing"
     assert quality.grade(response, error, excited, None, options).tolist() == [0] * 3 + [quality.GRADE_WEAK] + [0] * 33
 
 

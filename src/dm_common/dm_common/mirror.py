@@ -9,6 +9,8 @@ from dm_common.limits import Limits
 
 #: Largest relative difference between the aperture radii of a calibration and of the mirror that it belongs to.
 APERTURE_TOLERANCE = 0.02
+#: Largest coordinate of an actuator, m: a larger one indicates another unit.
+FARTHEST_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,16 @@ class Mirror:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.serial, str):
+            raise ValueError(f"serial = {self.serial!r}: must be text")
+        for name in ("x", "y"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         if self.x.ndim != 1 or self.x.shape != self.y.shape or self.x.size == 0:
             raise ValueError(f"actuator_x has {self.x.size} values and actuator_y {self.y.size}: must be equal, not 0")
         if not (np.isfinite(self.x).all() and np.isfinite(self.y).all()):
             raise ValueError("actuator_x and actuator_y must be finite")
+        if (farthest := float(max(np.abs(self.x).max(), np.abs(self.y).max()))) > FARTHEST_M:
+            raise ValueError(f"actuator_x and actuator_y reach {farthest:g}: must be m, within {FARTHEST_M:g}")
         if not self.working_radius > 0:
             raise ValueError(f"working_radius = {self.working_radius}: must be positive, m")
         pairs = self.limits.pairs

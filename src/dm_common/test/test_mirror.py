@@ -25,3 +25,12 @@ def test_a_mismatch_names_both_sides() -> None:
 @pytest.mark.parametrize("radius", [11e-3 * (1 + 1.01 * APERTURE_TOLERANCE), 0.0, np.nan, np.inf])
 def test_another_aperture_or_none_is_a_mismatch(radius: float) -> None:
     assert mismatch(MIRROR, "S 7/é", 2, radius)
+
+
+def test_what_is_no_mirror_is_named() -> None:
+    lists = Mirror("PDM", "1", [0.0, 4.3e-3], [0.0, 0.0], working_radius=11e-3)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(lists.x, MIRROR.x)
+    with pytest.raises(ValueError, match=r"reach 4\.3: must be m, within 1"):
+        Mirror("PDM", "1", 1e3 * MIRROR.x, MIRROR.y, working_radius=11e-3)
+    with pytest.raises(ValueError, match="serial = 1234: must be text"):
+        Mirror("PDM", 1234, MIRROR.x, MIRROR.y, working_radius=11e-3)  # type: ignore[arg-type]

@@ -1,5 +1,6 @@
 """Maps not measured by a run of this suite: files, arrays or measurements, with their commands."""
 
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
-from dm_calibration.hysteresis.response_fit import check_signals
+from dm_calibration.hysteresis.response_fit import TIME_MAX_S, check_signals
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
@@ -24,8 +25,10 @@ from dm_common.mirror import Mirror
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
-#: Largest absolute time, s: stamps are int64 numbers of ns.
-TIME_MAX_S = 9e9
+#: Unix times before this one, s, in 1973, count from any start.
+UNIX_MIN_S = 1e8
+#: s by which `moved` may be beside the times of the maps: what rounding to floats near the present leaves.
+ROUNDED_S = 1e-6
 
 #: Largest peak-to-valley sag of an array, m: a larger one indicates another unit.
 SAG_MAX = 1e-3
@@ -41,8 +44,9 @@ def outcome_of(
     mirror: Mirror,
     settings: IngestSettings | None = None,
     hysteresis: bool = False,
+    moved: ArrayLike | None = None,
 ) -> Outcome:
-    """The maps in their order, as if a run had measured them; files of a folder are sorted by name.
+    """The maps in their order, as if a run had measured them; files of a folder are sorted by name, numbers by value.
 
     Args and errors as for :func:`~dm_calibration.calibrator.calibrate`. If neither `times` nor the files give the times
     of all maps, they are set one second apart, the last one to the present.
@@ -74,8 +78,10 @@ def outcome_of(
             )
         last = time.time_ns()
         measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
-    if hysteresis and len({one.stamp_ns for one in measured}) == 1 < count:
-        raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
+    if moved is not None:
+        measured = _moved(measured, np.asarray(moved, dtype=np.float64))
+    if hysteresis:
+        _check_times(measured, signals)
     outcome = Outcome()
     rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # one that never moves rests where it is
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
@@ -100,6 +106,51 @@ def outcome_of(
     return outcome
 
 
+def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Floats | None]:
+    """`times` (M,) and `moved` (M,), s, as Unix times: if they count from any start, the last map is of the present."""
+    taken = np.asarray(times, dtype=np.float64)
+    shapes = None if moved is None else np.asarray(moved, dtype=np.float64)
+    last = taken.max(initial=0.0)
+    shift = time.time() - last if last < UNIX_MIN_S else 0.0
+    return taken + shift, None if shapes is None else shapes + shift
+
+
+def _moved(measured: Sequence[Measurement], moved: Floats) -> list[Measurement]:
+    """The measurements with the times when the mirror took their shapes, (M,) s."""
+    taken = np.array([1e-9 * one.stamp_ns for one in measured])
+    if moved.shape != taken.shape:
+        raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} numbers of s")
+    before = np.concatenate(([-np.inf], taken[:-1]))
+    wrong = ~((moved >= before - ROUNDED_S) & (moved <= taken + ROUNDED_S))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"moved: number {row + 1} is {moved[row] - taken[row]:+g} s from the time of its map: must lie between the "
+            f"map before ({before[row] - taken[row]:+g} s) and its own"
+        )
+    pairs = zip(measured, moved, strict=True)
+    return [replace(one, moved_ns=min(round(1e9 * at), one.stamp_ns)) for one, at in pairs]
+
+
+def _check_times(measured: Sequence[Measurement], signals: Floats) -> None:
+    """Raise ValueError where times of maps do not tell hysteresis and creep apart."""
+    stamps = np.array([one.stamp_ns for one in measured])
+    if not np.ptp(stamps) and len(stamps) > 1:
+        raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
+    same = (np.diff(stamps) == 0) & np.diff(signals, axis=0).any(axis=1)
+    if same.any():
+        row = int(same.argmax()) + 1
+        raise ValueError(
+            f"times: maps {row} and {row + 1} have the same, but not the same command; give `times` if those of the "
+            "files are whole seconds"
+        )
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts names by the values of their numbers: m2 before m10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name)]
+
+
 def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Measurement], dict[int, str]]:
     """One measurement per map; those from files with time and digest.
 
@@ -111,7 +162,7 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     """
     if isinstance(maps, str | Path):
         folder = Path(maps)
-        maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        maps = sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=_by_number)
         if not maps:
             raise ValueError(f"{folder}: holds no map file ({', '.join(SUFFIXES)})")
     ingest, found, dropped = Ingest(), list[Measurement | None](), dict[int, str]()

@@ -21,6 +21,8 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 #: Outliers: a map whose residual exceeds OUTLIER medians contradicts the law (the mirror was touched, or the map is of
 #: another). It is fitted again without them, OUTLIER_ROUNDS fits at most, unless they exceed the share OUTLIERS_MAX.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
+#: Effective signals, which go to about 1, from which on creep from before the run is taken for a drift of the figure.
+CREPT_MAX = 1.5
 #: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
 
@@ -79,7 +81,7 @@ def fit_hysteresis(
         held_out_max_zernike=_largest_of(covariance),
         unknown_sigma=unknown_history_sigma(found.fit.law, *run.reach),
         maps=int(run.responses.usable.sum()),
-        remarks=(*_remarks(found), *_left_out(maps, run)),
+        remarks=(*_remarks(found), *_left_out(maps, run), *_drifted(law)),
     )
 
 
@@ -108,6 +110,17 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
     more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
     return (
         f"Hysteresis: {len(labels)} maps say nothing of the model or contradict it: {', '.join(labels[:5])}{more}.",
+    )
+
+
+def _drifted(law: HysteresisModel) -> tuple[str, ...]:
+    """A sentence where the maps want more creep from before the run than the range of signals can have left."""
+    most = float(np.abs(law.crept).max(initial=0.0))
+    if most < CREPT_MAX:
+        return ()
+    return (
+        f"Hysteresis: the figure drifted by more than earlier creep explains (signals of {most:.1f}, where 1 is the "
+        "end of the range): the promise does not include such drift, bounds of requests do.",
     )
 
 
@@ -198,7 +211,8 @@ def _largest_of(covariance: Floats) -> float:
 def _remarks(found: Identification) -> tuple[str, ...]:
     best = found.fit.candidate.name
     others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
-    sentences = [f"Hysteresis: {best} predicts the maps left out best; error of other models relative to it: {others}."]
+    compared = f"; error of other models relative to it: {others}" if others else ""
+    sentences = [f"Hysteresis: {best} predicts the maps left out best{compared}."]
     tried = any(one.own and one.hysteretic and one.name in found.scores for one in CANDIDATES)
     if tried and not found.fit.candidate.own:
         sentences.append("Hysteresis: the maps do not tell the actuators' loops apart; all share one law.")

@@ -22,6 +22,8 @@ from dm_common.hysteresis.model import HysteresisModel
 LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
 #: Size to which all measurements are scaled, m: that of a deformation, for which the thresholds of the fit are made.
 _SIZE = 1e-6
+#: Largest absolute time, s: stamps of maps are int64 numbers of ns.
+TIME_MAX_S = 9e9
 #: Contiguous blocks of rows in each part that is left out.
 _BLOCKS = 5
 
@@ -51,14 +53,17 @@ class ResponseFit:
     measurements: int
     remark: str = ""
 
-    def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
+    def predict(self, commands: ArrayLike, times: ArrayLike | None = None, moved: ArrayLike | None = None) -> Floats:
         """(M, D) measurements predicted for `commands` (M, N) at `times` (M,) s, from a degauss or from rest.
+
+        `moved`, and what is raised, are those of :func:`identify_response`.
 
         Raises ValueError as :func:`identify_response` does for commands and times.
         """
         signals = _signals(commands, len(self.influence))
         rested = self.law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S)
-        effective, _ = follow(self.law, rested, signals, _seconds(times, len(signals)))
+        seconds, shapes = _seconds(times, moved, len(signals))
+        effective, _ = follow(self.law, rested, signals, seconds, shapes)
         return np.asarray(self.figure + effective @ self.influence)
 
     def __str__(self) -> str:
@@ -76,6 +81,7 @@ def identify_response(
     measured: ArrayLike,
     times: ArrayLike | None = None,
     *,
+    moved: ArrayLike | None = None,
     candidates: Sequence[Candidate] = LAWS,
 ) -> ResponseFit:
     """Fit each law to a record and compare what they predict of its parts left out.
@@ -90,6 +96,8 @@ def identify_response(
         subtract what is not due to the mirror, such as a tilt that changes from map to map. Rows with NaN are ignored.
     times : array_like (M,), optional
         Times of the measurements, s; needed for creep and drift. By default one second apart.
+    moved : array_like (M,), optional
+        When the mirror took each shape, on the clock of ``times``; by default right after the measurement before.
     candidates
         Laws to compare, as for :func:`~dm_calibration.hysteresis.identify.identify`.
 
@@ -98,26 +106,32 @@ def identify_response(
     ExcitationError
         Too few measurements, or more than a tenth of the actuators, and more than one, that hardly move or turn.
     ValueError
-        Arrays that do not belong together, measurements without a whole row or that never change, or times that run
-        backwards.
+        Arrays that do not belong together, measurements without a whole row or that never change, actuators that always
+        have the same commands, or times that run backwards or are not s.
     """
     signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
     if values.ndim != 2 or len(values) != len(signals):
         raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, numbers of a measurement)")
-    seconds = _seconds(times, len(signals))
+    seconds, shapes = _seconds(times, moved, len(signals))
     if not np.ptp(seconds) > 0.0:
         raise ValueError("times: all are the same; leave them out where they are not known")
     usable: Bools = np.asarray(np.isfinite(values).all(axis=1))
     if not usable.any():
         raise ValueError("measured: each row holds NaN or an infinity; leave out columns that do in all rows")
-    size = float(values[usable].std(axis=0).max())
+    with np.errstate(over="ignore"):
+        size = float(values[usable].std(axis=0).max())
     if not size > 0.0:
         raise ValueError("measured: nothing in it changes")
+    if not size < np.inf:
+        raise ValueError(f"measured reaches {np.abs(values[usable]).max():g}: too large to compute with")
+    if not candidates:
+        raise ValueError("candidates: must be at least one law")
+    _check_apart(signals)
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
     if brought.shape[1] > len(brought):
         # Fewer values per row with the same sums of squares.
         brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
-    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable))
+    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), moved=shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
     signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
     error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)
@@ -154,13 +168,32 @@ def check_signals(signals: Floats) -> None:
         raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
 
 
-def _seconds(times: ArrayLike | None, count: int) -> Floats:
+def _check_apart(signals: Floats) -> None:
+    """Raise ValueError where actuators that move always have the same commands."""
+    moving = np.flatnonzero(np.ptp(signals, axis=0))
+    _, group, size = np.unique(signals[:, moving], axis=1, return_inverse=True, return_counts=True)
+    together = moving[size[group.ravel()] > 1] + 1
+    if together.size:
+        names = ", ".join(map(str, together.tolist()))
+        raise ValueError(f"commands: do not tell the actuators {names} apart: each must move on its own in some row")
+
+
+def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:
+    """(count,) s from the first measurement on: of the measurements and, where known, of the shapes."""
     seconds = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, dtype=np.float64)
     if seconds.shape != (count,):
         raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), s")
     if not np.isfinite(seconds).all():
         raise ValueError(f"times: number {_first(~np.isfinite(seconds))} is NaN or infinite")
-    return seconds - seconds[0]
+    if not np.abs(seconds).max() < TIME_MAX_S:
+        raise ValueError(f"times go up to {np.abs(seconds).max():g}: must be s, not ns, within {TIME_MAX_S:g}")
+    if moved is None:
+        return seconds - seconds[0], None
+    shapes = np.asarray(moved, dtype=np.float64)
+    before = np.concatenate(([-np.inf], seconds[:-1]))
+    if shapes.shape != (count,) or not ((before <= shapes) & (shapes <= seconds)).all():
+        raise ValueError(f"moved: must be ({count},) s, each between the measurement before and its own")
+    return seconds - seconds[0], shapes - seconds[0]
 
 
 def _first(rows: Bools) -> int:

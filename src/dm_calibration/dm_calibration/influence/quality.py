@@ -53,7 +53,7 @@ def grade(
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
-    dead = (response < options.dead_sigmas * standard_error) | (response < DEAD_SHARE * overall)
+    dead = (response < options.dead_sigmas * standard_error) | (response <= DEAD_SHARE * overall)
     weak = uncertain | (response < options.weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
