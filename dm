@@ -38,7 +38,7 @@ usage: ./dm COMMAND [OPTION ...]
 
 The first hour
   up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
-  calibrate  measure and store a calibration with hysteresis and creep, 200 maps, four minutes
+  calibrate  measure and store a calibration with hysteresis and creep, 300 maps, seven minutes
   focus      ask for a curvature (or --dioptre): the promise first, then the move
   status     what runs, where the mirror stands, what it promises, what to do next
 

@@ -31,7 +31,8 @@ print(f"{known.name}: coefficients right to {known.held_out_max_zernike * 1e9:.2
 
 # What the model says of the run: effective signals, and the Zernike coefficients that follow from them.
 maps = calibration.maps
-start = rested(known.law, np.zeros(mirror.actuators), known.law.crept_at)  # with what it had crept to before the run
+# Demagnetised, with what the actuators had crept to before the run.
+start = rested(known.law, mirror.rest, known.law.crept_at, mirror.limits.middle)
 times, moved = 1e-9 * maps.stamp_ns, maps.moved_s() + 1e-9 * maps.stamp_ns[0]
 effective, _ = follow(known.law, start, maps.applied, times, moved)
 predicted = calibration.fit.zernike_offset + effective @ calibration.fit.influence_zernike.T

@@ -48,10 +48,8 @@ from studies.solvers.registry import MirrorFacts, make_solver
 LINEAR_READINGS = ("stored", "measured", "closed loop")
 OPEN_HYSTERESIS, LOOP_HYSTERESIS = "stored with hysteresis", "closed loop with hysteresis"
 READINGS = (*LINEAR_READINGS, OPEN_HYSTERESIS, LOOP_HYSTERESIS)
-#: Number of maps of a closed loop.
-LOOP_MAPS = 3
-#: Pixels across a map that is kept for drawing.
-DRAWN_PIXELS = 160
+#: Number of maps of a closed loop; pixels across a map that is kept for drawing.
+LOOP_MAPS, DRAWN_PIXELS = 3, 160
 
 
 class Method(NamedTuple):
@@ -296,6 +294,6 @@ def fitting_limit(samples: Samples, target: FocusTarget) -> tuple[float, float]:
     return rms_sag(left, model), left.max_zernike
 
 
-def order_errors(zernike: Floats) -> NDArray[np.float64]:
+def order_errors(zernike: Floats) -> Floats:
     """(..., 4) largest absolute coefficient of each radial order 2 to 5 in (..., 21)."""
     return np.stack([np.abs(zernike[..., a:b]).max(axis=-1) for a, b in pairwise((3, 6, 10, 15, 21))], axis=-1)

@@ -122,8 +122,10 @@ def test_what_is_refused() -> None:
             identify_response(bad, measured, times) if array is commands else identify_response(commands, measured, bad)
     with pytest.raises(ValueError, match=r"times go up to 1\.7e\+18: must be s, not ns"):
         identify_response(commands, measured, 1e9 * times + 1.7e18)
-    with pytest.raises(ValueError, match=r"moved: must be \(160,\) s, each between the measurement before and its own"):
+    with pytest.raises(ValueError, match=r"moved: number 1 is \+0\.1 s from the time of its map"):
         identify_response(commands, measured, times, moved=times + 0.1)
+    with pytest.raises(ValueError, match=r"times: must be numbers of s, not datetime64\[m\]"):
+        identify_response(commands, measured, np.arange(160).astype("datetime64[m]"))
     with pytest.raises(ValueError, match="do not tell the actuators 3, 5 apart"):
         identify_response(np.where(np.arange(19) == 4, commands[:, 2:3], commands), measured, times)
     with pytest.raises(ValueError, match="candidates: must be at least one law"):

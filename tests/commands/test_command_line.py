@@ -178,6 +178,10 @@ def test_what_is_next_is_said_for_the_mirror_that_was_asked(capsys: pytest.Captu
     parsed(*left.split("./dm ")[2].split(";")[0].split())
     there = "ros2 lifecycle set /left/pdm_driver activate, then ./dm doctor --namespace left again; ./dm exec true"
     assert output.in_namespace(there.replace("/left", "").replace(" --namespace left", ""), "left") == there
+    assert (
+        output.in_namespace("lifecycle set /left/pdm_driver activate", "left")
+        == "lifecycle set /left/pdm_driver activate"
+    )
 
 
 def test_a_device_or_pipe_for_figures_stays_one(tmp_path: Path) -> None:

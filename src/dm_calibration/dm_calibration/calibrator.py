@@ -73,7 +73,7 @@ def calibrate(
     maps
         A folder of map files, a list of map files, sag as an array (M, height, width) in m (NaN = no data; give
         ``settings`` with the pitch), a list of :class:`~dm_common.measurement.Measurement`, or the
-        :class:`~dm_calibration.procedure.outcome.Outcome` of a run, which holds its commands and times.
+        :class:`~dm_calibration.procedure.outcome.Outcome` of a run, which holds its commands and all times.
     commands : array_like (M, N)
         Normalised signals applied to the mirror, one row for each map.
     times : array_like (M,), optional
@@ -81,7 +81,8 @@ def calibrate(
         given in the files, some of which have whole seconds only. Required for hysteresis.
     moved : array_like (M,), optional
         When the mirror took each shape, on the clock of ``times``; by default right after the map before. Give it where
-        saving a map or anything else came between: without it creep is found wrong, and held-out errors do not show it.
+        saving a map or anything else came between: without it creep is found wrong, and held-out errors show little of
+        it.
     mirror
         Positions of the actuators, working aperture and limits.
     options
@@ -111,7 +112,8 @@ def calibrate(
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError
         Commands or times that do not match the maps, commands that are not normalised, or, where hysteresis is to be
-        identified, times that are missing, the same for maps of two commands, or run backwards.
+        identified, times that are missing, the same for maps of two commands, or run backwards; or shapes taken before
+        the map before or after their own.
     """
     if isinstance(maps, Outcome):
         outcome = maps

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.moves import WriterState
@@ -64,10 +64,13 @@ def driver_health(
     }
     if not state.link_up:
         return Health(ERROR, f"link lost: {state.fault}", values)
-    if refusal is not None:
-        return Health(WARN, f"the last command was refused: {refusal}", values)
     if not state.enabled:
         return Health(WARN, "inactive: commands are refused", values)
+    if writer.unrecorded:
+        return Health(WARN, f"{writer.unrecorded}; after a kill the first frame would be one step", values)
+    # What an unreachable unit refused is over: the link is up.
+    if refusal is not None and refusal.error_code != ErrorCode.ELECTRONICS_UNREACHABLE:
+        return Health(WARN, f"the last command was refused: {refusal}", values)
     if not state.history_known:
         return Health(WARN, "active; the actuators' history is not known: a degauss makes it known", values)
     return Health(OK, "active", values)

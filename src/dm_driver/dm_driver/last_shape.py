@@ -9,6 +9,7 @@ Two slots are written in turn, each with a checksum, so that one is complete at 
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
 """
 
+import errno
 import fcntl
 import logging
 import os
@@ -35,7 +36,7 @@ class LastShape:
         path: the file; its folder is made. None = nothing is kept.
 
     Raises:
-        OSError: the file cannot be made or opened.
+        OSError: the file cannot be made or opened, or the disk is full.
     """
 
     def __init__(self, path: Path | None, actuators: int) -> None:
@@ -43,9 +44,12 @@ class LastShape:
         self._slot = _HEAD.size + 8 * actuators + _CHECK.size
         self._number = 0
         self._descriptor = -1
+        #: Why nothing is kept of what was sent last, as a sentence; "" = it is, or is not wanted.
+        self.trouble = ""
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+            os.posix_fallocate(self._descriptor, 0, 2 * self._slot)  # a disk that fills later takes nothing away
 
     def claim(self) -> None:
         """Keep other drivers with this record away from the unit, until :meth:`close` or the end of the process.
@@ -96,7 +100,10 @@ class LastShape:
             return
         self._number += 1
         content = _HEAD.pack(_MAGIC, self._number, self._actuators) + codes.astype("<f8").tobytes()
-        os.pwrite(self._descriptor, content + _CHECK.pack(zlib.crc32(content)), self._slot * (self._number % 2))
+        record = content + _CHECK.pack(zlib.crc32(content))
+        if os.pwrite(self._descriptor, record, self._slot * (self._number % 2)) < len(record):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self.trouble = ""
 
     def close(self) -> None:
         """Close the file; its content stays."""

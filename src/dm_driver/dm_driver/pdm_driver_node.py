@@ -110,8 +110,10 @@ class PdmDriverNode(ManagedNode):
         try:
             return LastShape(path, actuators)
         except OSError as error:
-            self.get_logger().warning(f"state_folder = {self._values['state_folder']!r} cannot be used: {error}")
-            return LastShape(None, actuators)
+            nothing = LastShape(None, actuators)
+            nothing.trouble = f"state_folder = {self._values['state_folder']!r} cannot be used: {error}"
+            self.get_logger().warning(nothing.trouble)
+            return nothing
 
     def activate(self) -> None:
         writer = self._gate.writer

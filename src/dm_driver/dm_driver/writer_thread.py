@@ -60,7 +60,6 @@ class WriterThread:
         self._output = output
         self._stamp_ns = stamp_ns
         self._last = last if last is not None else LastShape(None, limiter.limits.actuators)
-        self._recording = True
         self._thread = threading.Thread(target=self._run, name="actuator_writer", daemon=True)
         # Everything below is guarded by this condition; it is notified at every change.
         self._change = threading.Condition()
@@ -254,14 +253,18 @@ class WriterThread:
             self._change.notify_all()
         self.counters.frames += 1
 
+    @property
+    def unrecorded(self) -> str:
+        """Why a driver that follows a killed one would not know what was sent last; "" = it would, or need not."""
+        return self._last.trouble
+
     def _record(self, shape: Shape) -> None:
         try:
             self._last.note(self._output.scale.exact_codes(shape))
-            self._recording = True
         except OSError as error:  # a full disk must not stop the mirror
-            if self._recording:
+            if not self._last.trouble:
                 logging.getLogger(__name__).warning("the last shape cannot be recorded: %s", error)
-            self._recording = False
+            self._last.trouble = f"the last shape cannot be recorded: {error}"
 
     def _check(self) -> None:
         self._check_at = time.monotonic() + CHECK_PERIOD_S

@@ -19,13 +19,18 @@ from dm_driver.driver_health import driver_health
         ({"history_known": False}, WARN, "history is not known"),
         ({"enabled": False}, WARN, "inactive"),
         ({"link_up": False, "fault": "no route"}, ERROR, "no route"),
+        ({"unrecorded": "the disk is full"}, WARN, "the disk is full; after a kill the first frame would be one step"),
+        ({"refusal": Refusal(ErrorCode.BUSY, "held")}, WARN, "the last command was refused: held"),
+        ({"refusal": Refusal(ErrorCode.BUSY, "held"), "enabled": False}, WARN, "inactive"),
+        ({"refusal": Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, "unplugged")}, OK, "active"),
     ],
 )
 def test_health_is_good_only_where_nothing_is_missing(changed: dict[str, Any], level: bytes, words: str) -> None:
     state = {"link_up": True, "enabled": True, "history_known": True, "moving": None, "fault": ""} | changed
     counters = SimpleNamespace(frames=0, link_losses=0, reconnects=0, overtaken=0, overruns=0)
-    writer: Any = SimpleNamespace(state=lambda: SimpleNamespace(**state), counters=counters)
-    health = driver_health(writer, None, {})
+    unrecorded = state.pop("unrecorded", "")
+    writer: Any = SimpleNamespace(state=lambda: SimpleNamespace(**state), counters=counters, unrecorded=unrecorded)
+    health = driver_health(writer, state.pop("refusal", None), {})
     assert health.level == level and words in health.message
 
 

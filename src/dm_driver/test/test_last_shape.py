@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -66,3 +68,17 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         LastShape(tmp_path / "unit.shape", 37)
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_full_disk_is_found_when_the_record_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "posix_fallocate", full)
+        with pytest.raises(OSError, match="No space left"):
+            LastShape(tmp_path / "unit.shape", 37)
+    record = LastShape(tmp_path / "unit.shape", 37)
+    monkeypatch.setattr(os, "pwrite", lambda *_: 10)  # bytes: less than was given
+    with pytest.raises(OSError, match="No space left"):
+        record.note(SHAPE)

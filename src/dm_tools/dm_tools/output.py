@@ -109,7 +109,7 @@ def in_namespace(text: str, namespace: str) -> str:
     """Add the namespace to each command in `text` that talks to running nodes."""
     if not namespace:
         return text
-    text = text.replace("lifecycle set /", f"lifecycle set /{namespace}/")
+    text = re.sub(rf"lifecycle set /(?!{namespace}/)", f"lifecycle set /{namespace}/", text)
     return re.sub(r"\./dm (?!(?:demo|exec|up)\b)[a-z-]+", rf"\g<0> --namespace {namespace}", text)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
-from dm_calibration.hysteresis.response_fit import TIME_MAX_S, check_signals
+from dm_calibration.hysteresis.response_fit import TIME_MAX_S, between, check_signals, seconds_of
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
@@ -27,8 +27,6 @@ Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
 #: Unix times before this one, s, in 1973, count from any start.
 UNIX_MIN_S = 1e8
-#: s by which `moved` may be beside the times of the maps: what rounding to floats near the present leaves.
-ROUNDED_S = 1e-6
 
 #: Largest peak-to-valley sag of an array, m: a larger one indicates another unit.
 SAG_MAX = 1e-3
@@ -46,10 +44,11 @@ def outcome_of(
     hysteresis: bool = False,
     moved: ArrayLike | None = None,
 ) -> Outcome:
-    """The maps in their order, as if a run had measured them; files of a folder are sorted by name, numbers by value.
+    """The maps in their order, as if a run had measured them; files of a folder are sorted by name, with digits as
+    whole numbers.
 
-    Args and errors as for :func:`~dm_calibration.calibrator.calibrate`. If neither `times` nor the files give the times
-    of all maps, they are set one second apart, the last one to the present.
+    Args and errors as for :func:`~dm_calibration.calibrator.calibrate`, but `times` are Unix times. If neither `times`
+    nor the files give the times of all maps, they are set one second apart, the last one to the present.
     """
     settings = settings or IngestSettings(aperture_radius=mirror.working_radius)
     measured, dropped = _measured(maps, settings, hysteresis)
@@ -70,6 +69,8 @@ def outcome_of(
             )
         measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
     elif not all(one.stamp_ns for one in measured):
+        if moved is not None:
+            raise ValueError("moved: needs the times of the maps, which neither `times` nor the files tell")
         if hysteresis:
             untold = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
             raise ValueError(
@@ -100,7 +101,9 @@ def outcome_of(
             if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
                 # No map shows the end of the degauss, which on a mirror driven in one direction is not at 0.
                 begin = {"kind": StepKind.REFERENCE, "step": -1, "signals": rest, "applied": rest}
-                outcome.take(without_map(one, label="degauss", stamp_ns=one.stamp_ns - 10**9, **begin))
+                outcome.take(
+                    without_map(one, label="degauss", stamp_ns=(one.moved_ns or one.stamp_ns) - 10**9, **begin)
+                )
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
         outcome.take(MapTaken(one, one.radius > 0.0))
     return outcome
@@ -108,9 +111,8 @@ def outcome_of(
 
 def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Floats | None]:
     """`times` (M,) and `moved` (M,), s, as Unix times: if they count from any start, the last map is of the present."""
-    taken = np.asarray(times, dtype=np.float64)
-    shapes = None if moved is None else np.asarray(moved, dtype=np.float64)
-    last = taken.max(initial=0.0)
+    taken, shapes = seconds_of(times, "times"), None if moved is None else seconds_of(moved, "moved")
+    last = taken.max(initial=-np.inf)
     shift = time.time() - last if last < UNIX_MIN_S else 0.0
     return taken + shift, None if shapes is None else shapes + shift
 
@@ -118,18 +120,9 @@ def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Float
 def _moved(measured: Sequence[Measurement], moved: Floats) -> list[Measurement]:
     """The measurements with the times when the mirror took their shapes, (M,) s."""
     taken = np.array([1e-9 * one.stamp_ns for one in measured])
-    if moved.shape != taken.shape:
-        raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} numbers of s")
-    before = np.concatenate(([-np.inf], taken[:-1]))
-    wrong = ~((moved >= before - ROUNDED_S) & (moved <= taken + ROUNDED_S))
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise ValueError(
-            f"moved: number {row + 1} is {moved[row] - taken[row]:+g} s from the time of its map: must lie between the "
-            f"map before ({before[row] - taken[row]:+g} s) and its own"
-        )
+    moved = between(moved, taken)
     pairs = zip(measured, moved, strict=True)
-    return [replace(one, moved_ns=min(round(1e9 * at), one.stamp_ns)) for one, at in pairs]
+    return [replace(one, moved_ns=min(round(1e9 * float(at)), one.stamp_ns)) for one, at in pairs]
 
 
 def _check_times(measured: Sequence[Measurement], signals: Floats) -> None:
@@ -146,9 +139,10 @@ def _check_times(measured: Sequence[Measurement], signals: Floats) -> None:
         )
 
 
-def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Key that sorts names by the values of their numbers: m2 before m10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name)]
+def _by_number(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Key that sorts names with their digits as whole numbers: m2 before m10."""
+    parts = re.split(r"([0-9]+)", path.stem)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], path.name
 
 
 def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Measurement], dict[int, str]]:

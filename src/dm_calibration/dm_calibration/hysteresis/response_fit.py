@@ -24,6 +24,8 @@ LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
 _SIZE = 1e-6
 #: Largest absolute time, s: stamps of maps are int64 numbers of ns.
 TIME_MAX_S = 9e9
+#: s by which `moved` may be beside the times of the maps: what rounding to floats near the present leaves.
+_ROUNDED_S = 1e-6
 #: Contiguous blocks of rows in each part that is left out.
 _BLOCKS = 5
 
@@ -56,13 +58,12 @@ class ResponseFit:
     def predict(self, commands: ArrayLike, times: ArrayLike | None = None, moved: ArrayLike | None = None) -> Floats:
         """(M, D) measurements predicted for `commands` (M, N) at `times` (M,) s, from a degauss or from rest.
 
-        `moved`, and what is raised, are those of :func:`identify_response`.
-
-        Raises ValueError as :func:`identify_response` does for commands and times.
+        Raises ValueError as :func:`identify_response` does for commands, times and `moved`.
         """
         signals = _signals(commands, len(self.influence))
-        rested = self.law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S)
         seconds, shapes = _seconds(times, moved, len(signals))
+        start = -BEFORE_FIRST_MAP_S if shapes is None else min(-BEFORE_FIRST_MAP_S, float(shapes[0]))
+        rested = self.law.demagnetised(signals.shape[1], start)
         effective, _ = follow(self.law, rested, signals, seconds, shapes)
         return np.asarray(self.figure + effective @ self.influence)
 
@@ -131,7 +132,8 @@ def identify_response(
     if brought.shape[1] > len(brought):
         # Fewer values per row with the same sums of squares.
         brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
-    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), moved=shapes)
+    start = -BEFORE_FIRST_MAP_S if shapes is None else min(-BEFORE_FIRST_MAP_S, float(shapes[0]))
+    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), start, shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
     signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
     error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)
@@ -180,7 +182,7 @@ def _check_apart(signals: Floats) -> None:
 
 def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:
     """(count,) s from the first measurement on: of the measurements and, where known, of the shapes."""
-    seconds = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, dtype=np.float64)
+    seconds = np.arange(count, dtype=np.float64) if times is None else seconds_of(times, "times")
     if seconds.shape != (count,):
         raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), s")
     if not np.isfinite(seconds).all():
@@ -189,11 +191,33 @@ def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tu
         raise ValueError(f"times go up to {np.abs(seconds).max():g}: must be s, not ns, within {TIME_MAX_S:g}")
     if moved is None:
         return seconds - seconds[0], None
-    shapes = np.asarray(moved, dtype=np.float64)
-    before = np.concatenate(([-np.inf], seconds[:-1]))
-    if shapes.shape != (count,) or not ((before <= shapes) & (shapes <= seconds)).all():
-        raise ValueError(f"moved: must be ({count},) s, each between the measurement before and its own")
-    return seconds - seconds[0], shapes - seconds[0]
+    return seconds - seconds[0], between(seconds_of(moved, "moved"), seconds) - seconds[0]
+
+
+def seconds_of(values: ArrayLike, name: str) -> Floats:
+    """`values` as numbers. Raises ValueError for dates, whose unit would be lost."""
+    if np.asarray(values).dtype.kind in "mM":
+        raise ValueError(f"{name}: must be numbers of s, not {np.asarray(values).dtype}")
+    return np.asarray(values, dtype=np.float64)
+
+
+def between(moved: Floats, taken: Floats) -> Floats:
+    """`moved` (M,) s, each brought to between the measurement before and its own, which are of `taken` (M,) s.
+
+    Raises:
+        ValueError: of another shape, not finite, or beside them by more than rounding.
+    """
+    if moved.shape != taken.shape:
+        raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} numbers of s")
+    before = np.concatenate(([-TIME_MAX_S], taken[:-1]))
+    wrong = ~((moved >= before - _ROUNDED_S) & (moved <= taken + _ROUNDED_S))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"moved: number {row + 1} is {moved[row] - taken[row]:+g} s from the time of its map: must lie between the "
+            f"map before ({before[row] - taken[row]:+g} s) and its own"
+        )
+    return np.clip(moved, before, taken)
 
 
 def _first(rows: Bools) -> int:

@@ -163,7 +163,8 @@ def run_of(maps: MapSet) -> Run:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    moved, start = maps.moved_s(), -BEFORE_FIRST_MAP_S
+    moved = maps.moved_s()
+    start = min(-BEFORE_FIRST_MAP_S, float(moved[0]))  # the first shape may have stood for long before its map
     return Run(maps.applied, time, responses_of(maps), start, moved, maps.segment, maps.degaussed, maps.rest)
 
 

@@ -13,7 +13,7 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 #: Variance of a held-out prediction, in variances of one measurement, beyond which it is extrapolation.
 EXTRAPOLATION_MAX = 10.0
-#: Share of the median response of all excited actuators below which one is dead.
+#: Share of the median response of all excited actuators up to which one is dead.
 DEAD_SHARE = 0.02
 
 #: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, as
@@ -68,8 +68,8 @@ def _uncertainty(response: Floats, standard_error: Floats, excited: Bools) -> tu
 def blur(response: Floats, standard_error: Floats, excited: Bools, weak_sigmas: float) -> list[str]:
     """Sentences on responses (N,) that are all uncertain; empty if they are not."""
     _, typical = _uncertainty(response, standard_error, excited)
-    if typical * weak_sigmas < 1.0:
-        return []
+    if typical * weak_sigmas < 1.0 or not np.isfinite(typical):
+        return []  # or nothing responds at all
     return [
         f"Responses are known to {typical:.0%} only (one standard error, median of the actuators): hysteresis, which a "
         "hysteresis plan takes apart from them, or noise blurs them all."

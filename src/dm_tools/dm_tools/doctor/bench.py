@@ -12,6 +12,7 @@ from typing import Any
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.sections import ConfigError
 from dm_bringup.suite import Config, load_config
+from dm_common.atomic_write import ros_home
 from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
@@ -56,6 +57,9 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
         yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
     else:
         yield from electronics_checks(effective("pdm_driver", driver))
+    for name in ("pdm_driver", "focus_controller"):
+        if folder := effective(name, sound.get(name, {}))["state_folder"]:
+            yield f"state folder of {name}", partial(writable_folder, ros_home(folder))
     watched = _folder_of(sound, "interferometer", "watch_folder")
     if watched is not None:
         writes = "{path}" in " ".join(sound["interferometer"].get("trigger_command", []))
@@ -234,7 +238,8 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
     own = [found for entry in entries if (found := entry.calibration) and found.mirror_serial == serial]
     damaged = [entry for entry in entries if entry.calibration is None]
     if damaged:
-        return Finding(damaged[0].remark, f"move it out of {folder}; restore it from your backup if you need it")
+        remarks = "; ".join(entry.remark for entry in damaged)
+        return Finding(remarks, f"move what is named out of {folder}; restore it from your backup if you need it")
     if not own:
         other = sorted({entry.calibration.mirror_serial for entry in entries if entry.calibration})
         seen = f"; those there are of {', '.join(other)}" if other else ""

@@ -148,6 +148,8 @@ def running_nodes(namespace: str = "") -> Finding:
 
     with DeformableMirrorClient(namespace) as client:
         client.wait(lambda: max(nodes_of_suite(client).values(), default=0) > 1, DISCOVERY_S)
+        if max(nodes_of_suite(client).values(), default=0) > 1:  # the others of the second suite, too
+            client.wait(lambda: min(nodes_of_suite(client).values(), default=0) > 1, DISCOVERY_S)
         if nodes_of_suite(client):
             client.wait(lambda: NEEDED.keys() <= nodes_of_suite(client).keys(), BUSY_S - DISCOVERY_S)
         count, place = nodes_of_suite(client), where(client)

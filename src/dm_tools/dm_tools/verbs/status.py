@@ -43,9 +43,11 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     )
     calibration = heard if heard is not None and heard.id else None
     shape, lacking = settled_shape(health), [name for name in NEEDED if not found[name]]
+    twice = [name for name, count in found.items() if count > 1]
     rows = {
         "nodes": f"{', '.join(found)}: running {place}"
-        + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
+        + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else "")
+        + (f"; [red]running more than once: {', '.join(twice)}[/]" if twice else ""),
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
         "calibration": _calibration(heard, times[-1] if times else time.time()),
