@@ -80,7 +80,7 @@ def outcome_of(
         last = time.time_ns()
         measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
     if moved is not None:
-        measured = _moved(measured, np.asarray(moved, dtype=np.float64))
+        measured = _moved(measured, seconds_of(moved, "moved"))
     if hysteresis:
         _check_times(measured, signals)
     outcome = Outcome()

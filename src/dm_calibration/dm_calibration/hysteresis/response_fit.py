@@ -14,7 +14,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
-from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run
+from dm_calibration.hysteresis.run import Run, start_of
 from dm_common import Bools, Floats
 from dm_common.hysteresis.model import HysteresisModel
 
@@ -62,8 +62,7 @@ class ResponseFit:
         """
         signals = _signals(commands, len(self.influence))
         seconds, shapes = _seconds(times, moved, len(signals))
-        start = -BEFORE_FIRST_MAP_S if shapes is None else min(-BEFORE_FIRST_MAP_S, float(shapes[0]))
-        rested = self.law.demagnetised(signals.shape[1], start)
+        rested = self.law.demagnetised(signals.shape[1], start_of(shapes))
         effective, _ = follow(self.law, rested, signals, seconds, shapes)
         return np.asarray(self.figure + effective @ self.influence)
 
@@ -132,8 +131,7 @@ def identify_response(
     if brought.shape[1] > len(brought):
         # Fewer values per row with the same sums of squares.
         brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
-    start = -BEFORE_FIRST_MAP_S if shapes is None else min(-BEFORE_FIRST_MAP_S, float(shapes[0]))
-    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), start, shapes)
+    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), start_of(shapes), shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
     signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
     error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)

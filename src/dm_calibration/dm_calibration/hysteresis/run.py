@@ -155,6 +155,11 @@ class Run:
         return solution[self.figure.shape[1] :], values - design @ solution
 
 
+def start_of(moved: Floats | None) -> float:
+    """When the degauss before a run had ended, s since its first map; its first shape may have stood for long."""
+    return -BEFORE_FIRST_MAP_S if moved is None else min(-BEFORE_FIRST_MAP_S, float(moved[0]))
+
+
 def run_of(maps: MapSet) -> Run:
     """The maps of one run, in the order measured, which begins with a degauss.
 
@@ -164,8 +169,7 @@ def run_of(maps: MapSet) -> Run:
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     moved = maps.moved_s()
-    start = min(-BEFORE_FIRST_MAP_S, float(moved[0]))  # the first shape may have stood for long before its map
-    return Run(maps.applied, time, responses_of(maps), start, moved, maps.segment, maps.degaussed, maps.rest)
+    return Run(maps.applied, time, responses_of(maps), start_of(moved), moved, maps.segment, maps.degaussed, maps.rest)
 
 
 def basis_of(columns: Floats) -> Floats:
