@@ -12,8 +12,8 @@ from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import HoldMirror, Measure, SetSignals
 
-from described_mirror import mirror_info_of
 from dm_common.errors import Refusal
+from dm_common.messages import mirror_info_of
 from dm_common.mirror import Mirror
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerActionServer, WorkerService
@@ -90,6 +90,9 @@ class StandIn:
         return response
 
     def on_set_signals(self, request: Any, response: Any) -> Any:
+        if self.driver_state == ActuatorState.STATE_INACTIVE:
+            response.error_code, response.message = ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active"
+            return response
         self.move(np.array(request.signals))
         response.applied = doubles(self.signals)
         return response

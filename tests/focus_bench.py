@@ -24,11 +24,10 @@ from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
-from described_mirror import mirror_info_of
 from dm_common.errors import ErrorCode
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
-from dm_common.messages import doubles, recipe_book_message, time_message
+from dm_common.messages import doubles, mirror_info_of, recipe_book_message, time_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerActionServer

@@ -22,7 +22,7 @@ from dm_common import Floats
 from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
-from dm_common.messages import doubles
+from dm_common.messages import doubles, mirror_info_of
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
@@ -103,22 +103,8 @@ def influence_model(actuators: int = 37) -> InfluenceModel:
 def mirror_info() -> MirrorInfo:
     """The mirror as the driver announces it."""
     x, y = hexagonal_positions(37, PITCH)
-    first, second = neighbour_pairs(x, y).T
-    return MirrorInfo(
-        name="PDM30-37",
-        serial=SERIAL,
-        actuators=37,
-        actuator_x=doubles(x),
-        actuator_y=doubles(y),
-        neighbour_a=first.tolist(),
-        neighbour_b=second.tolist(),
-        full_aperture_diameter=0.03,
-        working_aperture_diameter=2 * WORKING_RADIUS,
-        signal_min=-1.0,
-        signal_max=1.0,
-        neighbour_difference_max=2.0,
-        slew_rate_max=SLEW_RATE,
-    )
+    mirror = Mirror("PDM30-37", SERIAL, x, y, WORKING_RADIUS, Limits(pairs=neighbour_pairs(x, y)))
+    return mirror_info_of(mirror, full_aperture_diameter=0.03, slew_rate_max=SLEW_RATE)
 
 
 def calibration(name: str, serial: str = SERIAL) -> Calibration:

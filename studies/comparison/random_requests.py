@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from dm_msgs.msg import Calibration, MirrorInfo
+from dm_msgs.msg import Calibration
 
 from dm_common import Floats
 from dm_common.errors import Refusal
-from dm_common.messages import doubles
+from dm_common.messages import mirror_info_of
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
@@ -62,22 +62,7 @@ class Requests:
 
 def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibration:
     """The focus controller's active calibration, from this message on `calibration` and `mirror_info` of the bench."""
-    mirror, limits = bench.mirror, bench.limits
-    info = MirrorInfo(
-        name=mirror.name,
-        serial=mirror.serial,
-        actuators=mirror.actuators,
-        actuator_x=doubles(mirror.x),
-        actuator_y=doubles(mirror.y),
-        working_aperture_diameter=2 * mirror.working_radius,
-        signal_min=limits.low,
-        signal_max=limits.high,
-        neighbour_a=limits.pairs[:, 0].tolist(),
-        neighbour_b=limits.pairs[:, 1].tolist(),
-        neighbour_difference_max=limits.neighbour_difference,
-        slew_rate_max=bench.slew_rate,
-    )
-    return active_calibration(calibration, info)
+    return active_calibration(calibration, mirror_info_of(bench.mirror, slew_rate_max=bench.slew_rate))
 
 
 def draw_targets(active: ActiveCalibration, count: int, rng: np.random.Generator) -> list[FocusTarget]:

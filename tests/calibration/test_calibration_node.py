@@ -286,6 +286,18 @@ def test_somebody_else_commands_meanwhile(node: NodeProcess, bench: StandIn, obs
     assert (bench.signals == 0.0).all()
 
 
+def test_the_driver_is_deactivated_meanwhile(node: NodeProcess, bench: StandIn, observer: Observer) -> None:
+    def deactivate() -> None:
+        bench.driver_state = ActuatorState.STATE_INACTIVE
+        bench.move(bench.mirror.rest)
+
+    ready(observer, node)
+    bench.on_label["poke+02"] = deactivate
+    result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert result.error_code == ErrorCode.DRIVER_INACTIVE
+    assert "activate it first" in result.message and "the mirror is left as it is" in result.message
+
+
 def test_neighbours_that_are_not_there(start: Callable[..., NodeProcess], observer: Observer, folder: Path) -> None:
     process = start("dm_calibration", "calibration", parameters(folder, driver_timeout=0.3, degauss_timeout=0.3))
     observer.record(CalibrationMsg, "calibration", qos.LATCHED)

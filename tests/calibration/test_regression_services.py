@@ -17,7 +17,6 @@ from dm_msgs.srv import FitInfluenceFunction, FitRegression, LoadCalibration, Pr
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
-from described_mirror import mirror_info_of
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
@@ -28,6 +27,7 @@ from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import NO_CALIBRATION
 from dm_common.limits import Limits
+from dm_common.messages import mirror_info_of
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerService

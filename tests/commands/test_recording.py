@@ -39,14 +39,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from typer.testing import CliRunner
 
-from described_mirror import mirror_info_of
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibration_parameters import PARAMETERS
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
-from dm_common.messages import doubles, taken, time_message
+from dm_common.messages import doubles, mirror_info_of, taken, time_message
 from dm_common.ros import qos
 from dm_tools.cli import make_app
 from dm_tools.output import NotRunningError

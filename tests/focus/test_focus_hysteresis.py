@@ -18,10 +18,10 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
-from dm_common.atomic_write import state_file
 from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecord, write_record
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.state_files import state_file
 from dm_controller.planning.active_calibration import active_calibration
 from focus_bench import HysteresisBench, calibration_with_history, make_law, mirror_info, recipe, recipe_book
 from support import NodeProcess, Observer, wait_until

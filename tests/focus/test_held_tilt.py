@@ -11,10 +11,10 @@ import pytest
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from described_mirror import mirror_info_of
 from dm_autofocus.boresight import STEP, find_boresight
 from dm_autofocus.optics import depth_of_focus
 from dm_calibration.calibration_messages import calibration_message
+from dm_common.messages import mirror_info_of
 from dm_common.optics.zernike import TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget

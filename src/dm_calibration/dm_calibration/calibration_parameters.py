@@ -19,9 +19,9 @@ PARAMETERS = (
     Parameter("calibration_folder", text("~/.ros/dm_calibrations", path=True), "Folder of the calibration files."),
     Parameter(
         "load_on_start",
-        text(""),
-        "Calibration to load as soon as the mirror is known: empty = none, last = the one last in use (if there was "
-        "none, the newest that fits), newest = the newest that fits, or an id.",
+        text("last"),
+        "Calibration to load as soon as the mirror is known: last = the one last in use (if there was none, the newest "
+        "that fits), newest = the newest that fits, an id, or empty = none.",
     ),
     live(
         "write_report",

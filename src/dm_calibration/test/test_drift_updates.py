@@ -546,7 +546,11 @@ def test_a_damaged_file_is_told_and_ignored(
     updates.take(bench.measure("check"), bench.settled())
     file = next(tmp_path.glob("*.updates.hdf5"))
     file.write_bytes(file.read_bytes()[:2000])
-    assert known(begun(made, tmp_path, remark="not a whole HDF5 file")).revision == 0
+    again = begun(made, tmp_path, remark="not a whole HDF5 file")
+    assert known(again).revision == 0
+    assert len(again.doubts) == 1 and "What maps showed earlier is not known" in again.doubts[0]
+    again.take(bench.measure("check"), bench.settled())
+    assert not again.doubts
 
 
 def test_updates_of_another_content_are_ignored(

@@ -1,7 +1,6 @@
-"""Files that are written whole or not at all, whatever happens meanwhile, and where nodes keep theirs."""
+"""Files that are written whole or not at all, whatever happens meanwhile."""
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,19 +21,6 @@ def storing(failure: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise StoreError(f"{failure}: {error.strerror or error}") from error
-
-
-def ros_home(place: str = "") -> Path:
-    """$ROS_HOME, by default ~/.ros; or `place` with this in place of its ~/.ros, home folders spelled out."""
-    usual = Path("~/.ros")
-    path, home = Path(place or usual), os.environ.get("ROS_HOME")
-    return (home / path.relative_to(usual) if home and path.is_relative_to(usual) else path).expanduser()
-
-
-def state_file(folder: str, suffix: str, *names: object) -> Path | None:
-    """The file in `folder`, a node's `state_folder`, of what `names` identify; None for an empty folder name."""
-    stem = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", str(name)).strip("-.") for name in names)[:200] or "mirror"
-    return ros_home(folder) / f"{stem}{suffix}" if folder else None
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -80,6 +80,24 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     )
 
 
+def mirror_info_of(mirror: Mirror, **more: Any) -> MirrorInfo:
+    """The message `mirror_info` that describes `mirror`, with `more` of its fields."""
+    limits = mirror.limits
+    first, second = (array("I", column.tolist()) for column in limits.pairs.T)
+    known: dict[str, Any] = {
+        **taken(mirror, "name", "serial", "actuators"),
+        "actuator_x": doubles(mirror.x),
+        "actuator_y": doubles(mirror.y),
+        "neighbour_a": first,
+        "neighbour_b": second,
+        "working_aperture_diameter": 2.0 * mirror.working_radius,
+        "signal_min": limits.low,
+        "signal_max": limits.high,
+        "neighbour_difference_max": limits.neighbour_difference,
+    }
+    return MirrorInfo(**known | more)
+
+
 #: Fields of Measurement that dm_msgs/SurfaceMapInfo and dm_msgs/ZernikeCoefficients have under the same names.
 OF_FILE = ("reference_surface", "instrument_error", "scale_error", "instrument", "pitch", "system_error_subtracted")
 OF_FIT = ("residual_rms", "radius", "wavelength")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dm_common.atomic_write import ros_home, state_file
+from dm_common.state_files import ros_home, state_file
 
 
 def test_ros_home_takes_the_place_of_the_usual_folder(monkeypatch: pytest.MonkeyPatch) -> None:

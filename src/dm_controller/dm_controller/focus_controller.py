@@ -92,6 +92,8 @@ class FocusController:
             self.hold.end("there is no calibration to hold it with")
             if refusal.error_code in (ErrorCode.CALIBRATION_MISMATCH, ErrorCode.CALIBRATION_UNREADABLE):
                 effects.append(Log("error", str(refusal)))
+            elif before is not None:
+                effects.append(Log("warning", f"calibration {before.calibration.id} is withdrawn: {refusal}"))
         return [*effects, PublishCapabilities()]
 
     def rest(self, refusal: Refusal, now: Moment) -> list[Effect]:

@@ -999,6 +999,7 @@ def test_a_calibration_that_cannot_be_used_ends_the_hold(bench: Bench, message: 
     bench.ask(0.02)
     bench.do(bench.controller.use(message, MIRROR))
     assert not bench.controller.hold.active
+    assert len(bench.log) == 2 and "calibration" in bench.log[-1]  # using one, and why no more
     bench.ask(0.01)
     assert bench.refusal().error_code == code
 

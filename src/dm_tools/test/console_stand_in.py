@@ -12,11 +12,10 @@ from dm_msgs.msg import ActuatorEstimate, ActuatorState, Calibration, Capabiliti
 from dm_msgs.srv import ListCalibrations, SetFocus, SetSignals
 from numpy.typing import NDArray
 
-from described_mirror import mirror_info_of
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.observer import HysteresisObserver
 from dm_common.limits import Limits
-from dm_common.messages import applied_from, estimate_message
+from dm_common.messages import applied_from, estimate_message, mirror_info_of
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis

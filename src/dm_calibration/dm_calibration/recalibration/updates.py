@@ -71,12 +71,14 @@ class RecalibrationManager:
 
     Attributes:
         in_use: None without a calibration; replaced as a whole.
+        ignored: why what is stored of earlier maps is not used; "" = it is.
     """
 
     def __init__(self, folder: Path, options: Callable[[], UpdateOptions]) -> None:
         self.folder, self._options = folder, options
         self._lock = threading.RLock()
         self.in_use: InUse | None = None
+        self.ignored = ""
 
     @property
     def mirror_changed(self) -> bool:
@@ -95,6 +97,8 @@ class RecalibrationManager:
             )
         if kept is not None and kept.drift.given_up:
             doubts.append(f"{kept.drift.given_up}.")
+        if self.ignored:
+            doubts.append(f"What maps showed earlier is not known: {self.ignored}.")
         return doubts
 
     @property
@@ -113,17 +117,17 @@ class RecalibrationManager:
             ValueError: the calibration's maps make no sense.
         """
         with self._lock:
-            self.in_use = None
+            self.in_use, self.ignored = None, ""
             if calibration is None:
                 return ""
             drift_filter = DriftFilter(calibration, self._options())
-            drift, remark = drift_filter.start(calibration.stamp_ns), ""
+            drift = drift_filter.start(calibration.stamp_ns)
             try:
                 drift = read_updates(self._file(calibration.id), calibration, drift) or drift
             except UpdatesFileError as error:
-                remark = f"updates of {calibration.id} are ignored: {error}"
+                self.ignored = f"updates of {calibration.id} are ignored: {error}"
             self.in_use = InUse(calibration, drift_filter, drift)
-            return remark
+            return self.ignored
 
     def take(
         self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
@@ -172,7 +176,7 @@ class RecalibrationManager:
                 changed = replace(kept.drift, surprising=kept.drift.surprising + 1, disagreement=worst)
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration, changed)
-            self.in_use = replace(kept, drift=changed)
+            self.in_use, self.ignored = replace(kept, drift=changed), ""
             with suppress(OSError):  # the update itself is stored
                 shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
                 append_check(self._file(calibration.id, LOG_SUFFIX), shown)
@@ -191,7 +195,8 @@ class RecalibrationManager:
             kept = self.kept()
             with storing(f"updates of {kept.calibration.id} were not removed"):
                 self._file(kept.calibration.id).unlink(missing_ok=True)
-            self.in_use = InUse(kept.calibration, kept.filter, kept.filter.start(kept.calibration.stamp_ns))
+            drift = kept.filter.start(kept.calibration.stamp_ns)
+            self.in_use, self.ignored = InUse(kept.calibration, kept.filter, drift), ""
 
     def kept(self) -> InUse:
         """What is in use, with a filter of the present options. Raises Refusal if no calibration is in use."""

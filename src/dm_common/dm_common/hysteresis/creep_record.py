@@ -169,7 +169,7 @@ class CreepRecorder:
             self._disk.submit(self._write, file, record)
 
     def _file(self, serial: str) -> Path | None:
-        from dm_common.atomic_write import state_file  # not imported at start, to save time
+        from dm_common.state_files import state_file  # not imported at start, to save time
 
         return state_file(self.folder, ".creep.npz", serial)
 

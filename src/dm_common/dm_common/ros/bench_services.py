@@ -214,8 +214,8 @@ class BenchServices:
                 self.apply(signals)
                 return "the mirror is back at mid range"
             except Refusal as error:
-                if self.hold.lost is not None:
-                    return f"the mirror is left as it is: {self.hold.lost}"
+                if self.hold.lost is not None or error.error_code == ErrorCode.DRIVER_INACTIVE:
+                    return f"the mirror is left as it is: {self.hold.lost or error}"
                 # A degauss or ramp that was cancelled here may still be running in the driver.
                 if error.error_code not in (ErrorCode.BUSY, ErrorCode.PREEMPTED) or time.monotonic() > deadline:
                     return f"the mirror could NOT be brought back to mid range: {error}"
@@ -231,7 +231,7 @@ class BenchServices:
             client = node.create_client(SetSignals, self._set_signals.service_name)  # of this namespace, as remapped
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
-                return "the mirror could NOT be brought back to mid range: the driver does not answer"
+                return "the mirror is left to pdm_driver, which ends too or does not answer"
             future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
             rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
             response = future.result() if future.done() else None
@@ -285,6 +285,7 @@ class BenchServices:
             requested = np.array(self.state.requested, dtype=np.float64)
             if requested.shape == self._commanded.shape and np.abs(requested - self._commanded).max() <= _SAME_SIGNAL:
                 return
+            self.check_ready()
             if time.monotonic() > deadline or self.cancelled():
                 raise Refusal(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
             time.sleep(0.01)

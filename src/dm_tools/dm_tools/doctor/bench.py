@@ -12,10 +12,10 @@ from typing import Any
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.sections import ConfigError
 from dm_bringup.suite import Config, load_config
-from dm_common.atomic_write import ros_home
 from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
+from dm_common.state_files import ros_home
 from dm_tools.doctor.electronics import electronics_checks
 from dm_tools.doctor.machine import Check, Finding, disk
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_bringup.suite import Config, Suite, load_config
-from dm_common.atomic_write import ros_home
+from dm_common.state_files import ros_home
 from dm_tools.output import checked_namespace, console, next_step
 from dm_tools.running_suite import calibration_refused, unknown_history
 
