@@ -17,9 +17,9 @@ from dm_tools.output import JsonOption, console, write_json
 #: Marker expression of `--fast`: it leaves out tests that start nodes as processes or take half a second and more.
 FAST = "not processes and not slow"
 _CORES = os.cpu_count() or 1
-#: The tests of nodes mostly wait, so two run at once for each core, but not more nodes than fit into the memory of a
+#: The tests of nodes mostly wait, so three run at once for each core, but not more nodes than fit into the memory of a
 #: small machine. conftest.py puts the longest ones first, and names the modules that stay whole.
-WORKERS = min(2 * _CORES, 12)
+WORKERS = min(3 * _CORES, 12)
 #: The other tests hardly wait; each worker imports the modules of all tests, which takes some ten seconds.
 FAST_WORKERS = _CORES + (_CORES + 1) // 2
 #: Takes a minute and more of one core in a fresh checkout, so it gets only the time that the tests leave.

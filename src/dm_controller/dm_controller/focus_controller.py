@@ -69,9 +69,7 @@ class FocusController:
     # --- what is known ---
 
     def use(self, calibration: Any, mirror: Any, recipes: Any = None) -> list[Effect]:
-        """Use a dm_msgs/Calibration, with its dm_msgs/RecipeBook, if it belongs to the dm_msgs/MirrorInfo (None = not
-        known); otherwise refuse requests. Recipes of another calibration are ignored.
-        """
+        """Use these dm_msgs as `active_calibration` does; where it refuses to, requests are refused from now on."""
         before, effects = self.active, list[Effect]()
         hold_tilt, axis = self._values["hold_tilt"], self._values["optical_axis"]
         try:
