@@ -108,6 +108,8 @@ def calibrate(
         A file or array is unusable. With ``hysteresis`` a map with too few data is left out, but its command counts.
     MeasurementError
         A map cannot be compared with those before it.
+    Refusal
+        A value of ``settings`` is not allowed; the message names it.
     TooFewMapsError
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError

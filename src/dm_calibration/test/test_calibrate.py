@@ -28,7 +28,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common import Floats
-from dm_common.errors import MeasurementError
+from dm_common.errors import MeasurementError, Refusal
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
@@ -255,6 +255,9 @@ def test_measurements_and_what_is_refused() -> None:
     for moved in (times + 0.1, times - 1.1, np.nan * times):
         with pytest.raises(ValueError, match=r"moved: number [12] is .* must lie between the map before"):
             calibrate(sag, commands, times, moved=moved, mirror=mirror, settings=settings)
+    for wrong, text in ({"pitch": np.nan}, "pitch = nan: must be"), ({"retrace": (2.0,)}, r"retrace\[0\] = 2: must be"):
+        with pytest.raises(Refusal, match=text):
+            calibrate(sag, commands, mirror=mirror, settings=replace(settings, **wrong))
     with pytest.raises(ValueError, match="commands reach 75: must be normalised to -1 to 1"):
         calibrate(sag, 150.0 * commands, mirror=mirror, settings=settings)
     gap = np.where(np.arange(len(sag))[:, None] == 3, np.nan, commands)

@@ -159,6 +159,13 @@ def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **ot
     return kind(**{name: tuple(one) if isinstance(one, list) else one for name, one in given.items()} | others)
 
 
+def check_parameters(of: Any) -> None:
+    """Check the fields of a dataclass that are parameters too, as a node checks these. Raises Refusal naming one."""
+    for each in fields(of):
+        if "value" in each.metadata:
+            each.metadata["value"].check(each.name, getattr(of, each.name))
+
+
 class Fields:
     """Checks of all fields of a request or goal, by a table {name: allowed values}; dots lead into nested messages."""
 

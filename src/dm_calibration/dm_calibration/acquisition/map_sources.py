@@ -21,6 +21,7 @@ from dm_common import Bools, Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
+from dm_common.values import check_parameters
 
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
@@ -51,6 +52,7 @@ def outcome_of(
     nor the files give the times of all maps, they are set one second apart, the last one to the present.
     """
     settings = settings or IngestSettings(aperture_radius=mirror.working_radius)
+    check_parameters(settings)
     measured, dropped = _measured(maps, settings, hysteresis)
     count = len(measured)
     signals = np.asarray(commands, dtype=np.float64)
