@@ -117,6 +117,8 @@ def test_maps_that_do_not_tell_their_lateral_resolution_are_not_refused_with_the
     mounted = MountedMirror(PlateConfig(), replace(CAMERA, mount_angle=0.5), wiring, tells_pitch=False)
     found, last = mounted.check(IngestSettings(), wiring)
     assert found.turned and last.pitch == 0.0
+    lost, beyond = poke_cure(found, MIRROR, replace(last, camera=(0, 0)), [])
+    assert "aperture.centre_x" not in lost["interferometer"] and "is not known, so it stays as it is" in beyond
     changes, beyond = poke_cure(found, MIRROR, last, [])
     assert not beyond
     cure = yaml.safe_load(parameter_text(changes))["/**/interferometer"]["ros__parameters"]

@@ -160,3 +160,18 @@ def test_inconsistent_calibrations_are_refused(mirror: LinearMirror) -> None:
         InfluenceModel(**{**fields, "sag_offset": np.zeros(3)})
     with pytest.raises(ValueError, match="influence_sag holds values that are not finite"):
         InfluenceModel(**{**fields, "influence_sag": np.full_like(mirror.influence, np.nan)})
+
+
+@pytest.mark.parametrize("moving", [1, 3, 18])
+def test_a_mirror_most_of_which_does_nothing_still_focuses(mirror: LinearMirror, moving: int) -> None:
+    model, moves = perfect_model(mirror, 0.0), np.arange(37) < moving
+    model = replace(model, influence_zernike=model.influence_zernike * moves, influence_sag=model.influence_sag * moves)
+    plan = CalibratedMirror(model, Limits(-1.0, 1.0, PAIRS, 2.0)).plan(FocusTarget(0.001))
+    assert np.isfinite(plan.max_zernike) and not plan.signals[~moves].any() and plan.signals[moves].any()
+
+
+@pytest.mark.parametrize("terms", [0, 1, 20])
+def test_another_number_of_terms_is_refused_by_name(mirror: LinearMirror, terms: int) -> None:
+    model = perfect_model(mirror, 0.0)
+    with pytest.raises(ValueError, match=f"zernike_offset has {terms} terms, must have 21"):
+        replace(model, influence_zernike=model.influence_zernike[:terms], zernike_offset=model.zernike_offset[:terms])

@@ -134,3 +134,9 @@ def test_a_run_that_may_end_early_asks_as_soon_as_a_law_can_be_found(rings: int,
     assert commands == looks
     for end in sorted(plan.ends):
         assert plan.steps[end - 1].kind in (StepKind.CHECK, StepKind.REFERENCE)
+
+
+def test_pokes_that_are_reduced_by_rounding_only_are_not_told() -> None:
+    mirror = make_mirror()
+    narrow = replace(mirror, limits=replace(mirror.limits, low=0.1, high=0.7))
+    assert make_plan(PlanKind.POKES, narrow, PlanOptions(poke_amplitude=1.0)).remarks == ()

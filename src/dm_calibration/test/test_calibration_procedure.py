@@ -9,7 +9,7 @@ import pytest
 
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
-from dm_calibration.procedure.outcome import MapTaken
+from dm_calibration.procedure.outcome import Doubted, Dropped, MapTaken, Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
 from dm_common.errors import Cancelled, Refusal
@@ -244,3 +244,39 @@ def test_shapes_as_in_use_are_on_the_flat_surface(kind: StepKind, count: int) ->
     size = np.median(np.abs(left[:, 3:]).max(axis=1))
     assert size < 0.1 * np.abs(plant.figure_coefficients).max()
     assert all((mirror.limits.differences(record.signals) <= 1.0).all() for record in checks)
+
+
+@pytest.mark.parametrize("pitch", [1.1e-4, 0.0])
+def test_where_a_coarse_map_ends_is_not_known_to_a_pixel(pitch: float, mirror: Mirror) -> None:
+    frame = LinearMirror(mirror.x, mirror.y).measurement(
+        np.zeros(300), 1, kind="reference", radius_px=100.0, pitch=pitch
+    )
+    check = BumpCheck(BumpOptions(), mirror, 0.1)
+    check.take(MapTaken(frame, centre=(0.0, 0.0)))
+    assert check.change(MapTaken(frame, centre=(1.2 * 1.1e-4, 0.0)), False) == ""
+    assert "the mirror moved by" in check.change(MapTaken(frame, centre=(2.0 * 1.1e-4, 0.0)), False)
+
+
+def test_the_figure_of_a_mirror_of_one_actuator_is_compared_too() -> None:
+    mirror = make_mirror(rings=0)
+    bench = LinearBench(mirror)
+    bench.changes["reference 2"] = {"coefficients": 1e-6 * np.eye(21)[4]}
+    with pytest.raises(Refusal, match="the figure changed by"):
+        run(bench, mirror)
+
+
+def test_what_failed_after_a_bump_is_measured_again(bench: LinearBench, mirror: Mirror) -> None:
+    first, *others = run(bench, mirror).outcome.records
+    outcome = Outcome()
+    for event in (
+        MapTaken(first),
+        Dropped(2, "poke+01: it was bad"),
+        MapTaken(others[1]),
+        Dropped(9, "a bowl: out of reach", whole=True),
+        Dropped(4, "poke+02: 30 % of the pixels"),
+        MapTaken(others[3]),
+    ):
+        outcome.take(event)
+    outcome.take(Doubted(2, "bumped"))
+    assert [step for step in range(10) if outcome.tried(step)] == [1, 2, 3, 9]
+    assert outcome.dropped == ["poke+01: it was bad", "a bowl: out of reach", f"{others[3].label}: bumped"]

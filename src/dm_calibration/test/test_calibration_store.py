@@ -317,3 +317,21 @@ def test_refit_of_stored_data(tmp_path: Path, calibration: Calibration) -> None:
         refit(calibration, FitOptions(), calibration.maps.label[2:], Provenance("x", 0))
     store.save(again)
     assert_equal(store.load("PDM_2"), again)
+
+
+def test_serial_numbers_that_look_alike_as_file_names_are_told_apart(tmp_path: Path, calibration: Calibration) -> None:
+    store = CalibrationStore(tmp_path)
+    for serial in ("12/3", "12-3", "Ω1", "Ж1", ""):
+        store.note_in_use(replace(calibration, id=f"of-{len(list(tmp_path.iterdir()))}", mirror_serial=serial))
+    assert [store.last_in_use(serial) for serial in ("12/3", "12-3", "Ω1", "Ж1", "")] == [f"of-{n}" for n in range(5)]
+
+
+def test_a_file_whose_maps_have_no_rows_is_listed_as_unreadable(tmp_path: Path, calibration: Calibration) -> None:
+    store = CalibrationStore(tmp_path)
+    store.save(calibration)
+    for name, change in (("flat", lambda signals: signals.ravel()), ("none", lambda signals: signals[:0])):
+        columns, attributes = to_columns(replace(calibration, id=name))
+        columns["maps/signals"] = change(columns["maps/signals"])
+        (tmp_path / f"{name}.h5").write_bytes(write_image(columns, attributes))
+    remarks = {entry.id: entry.remark for entry in store.entries()}
+    assert remarks.pop("PDM_1") == "" and all("signals" in remark for remark in remarks.values()), remarks

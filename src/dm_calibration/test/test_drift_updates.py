@@ -593,7 +593,7 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
     assert good.max_zernike < 2e-9 < bad.max_zernike and good.surprise < 2.0 < bad.surprise
     assert 1 <= good.actuator <= bench.mirror.actuators
     whole = file.read_bytes()
-    for content, taken in ((whole, 3), (whole + b"\r\n", 3), (b"", 1)):
+    for content, taken in ((whole, 3), (whole + b"\r\n", 3), (whole + b"\0" * 200_000, 3), (b"", 1)):
         file.write_bytes(content)
         updates.take(bench.measure("bad"), bench.settled())
         assert len(read_checks(file)) == taken

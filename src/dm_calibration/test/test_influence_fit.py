@@ -331,3 +331,17 @@ def test_unknown_method_and_label(mirror: Mirror) -> None:
         fit_influence(maps, FitOptions(method="AZreq"))
     with pytest.raises(UnknownNameError, match=r"map label 'poke\+1' is unknown; did you mean poke\+"):
         fit_influence(maps, exclude=["poke+1"])
+
+
+@pytest.mark.parametrize("dead", [0, 3])
+def test_a_dead_actuator_shows_no_hysteresis_and_hides_none(dead: int) -> None:
+    mirror, gains = make_mirror(rings=1), np.ones(7)
+    gains[dead] = 0.0
+    plant = LinearMirror(mirror.x, mirror.y, noise=1 * NM, gains=gains)
+    assert fit_influence(measure(plant, mirror), rings=mirror.rings).held_out_max_zernike < 3 * NM
+    # What a share of a move comes to, without and with noise in the place of a response.
+    whole = LinearMirror(mirror.x, mirror.y)
+    alive = whole.fit_terms(whole.influence.T).T
+    known = alive * gains + 0.1 * NM * np.random.default_rng(1).standard_normal(alive.shape) * (1.0 - gains)
+    expected, allowed = (quality.with_loops(0.0, 0.1, influence, mirror.limits)[0] for influence in (alive, known))
+    assert allowed > 0.5 * expected > 10 * NM

@@ -117,7 +117,7 @@ class CreepHold:
         ahead = 0.5 * (now - command.sent.time)
         change = planner.hold(estimate.state, now, move.effective, ahead) - estimate.state.signals
         largest = float(np.abs(change).max())
-        if largest < 0.5 * values["hold.resolution"]:
+        if largest <= 0.5 * values["hold.resolution"]:
             return None
         self.corrections += 1
         return estimate.state.signals + change * min(1.0, values["hold.slew"] / largest)

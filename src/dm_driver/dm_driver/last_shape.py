@@ -103,6 +103,9 @@ class LastShape:
         record = content + _CHECK.pack(zlib.crc32(content))
         if os.pwrite(self._descriptor, record, self._slot * (self._number % 2)) < len(record):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if self._number == 1:  # what was noted for another number of actuators is out of date
+            os.pwrite(self._descriptor, bytes(self._slot), 0)
+            os.ftruncate(self._descriptor, 2 * self._slot)
         self.trouble = ""
 
     def close(self) -> None:

@@ -82,3 +82,16 @@ def test_a_full_disk_is_found_when_the_record_is_made(tmp_path: Path, monkeypatc
     monkeypatch.setattr(os, "pwrite", lambda *_: 10)  # bytes: less than was given
     with pytest.raises(OSError, match="No space left"):
         record.note(SHAPE)
+
+
+@pytest.mark.parametrize(("one", "other"), [(37, 7), (7, 37)])
+def test_what_was_noted_before_another_number_of_actuators_is_out_of_date(tmp_path: Path, one: int, other: int) -> None:
+    path = tmp_path / "unit.shape"
+    for _ in range(3):
+        LastShape(path, one).note(np.full(one, 4000.0))
+    assert LastShape(path, other).load() is None
+    assert LastShape(path, one).load() is not None, "a driver that sent nothing changes nothing"
+    LastShape(path, other).note(np.full(other, 60000.0))
+    assert LastShape(path, one).load() is None
+    found = LastShape(path, other).load()
+    assert found is not None and (found == 60000.0).all()

@@ -70,6 +70,8 @@ class MapSet:
         points = self.points
         if not (points.x.shape == points.y.shape == points.weight.shape and points.x.ndim == 1 and points.x.size):
             raise ValueError(f"sampling points: x {points.x.shape}, y {points.y.shape}, weight {points.weight.shape}")
+        if self.coefficients.ndim != 2 or self.signals.ndim != 2 or not len(self.coefficients):
+            raise ValueError(f"coefficients {self.coefficients.shape}, signals {self.signals.shape}: rows of maps")
         count, terms = self.coefficients.shape
         expected = (
             ((count,), ("step", "stamp_ns", "residual_rms", "valid_fraction", "moved_ns", "segment", "temperature")),

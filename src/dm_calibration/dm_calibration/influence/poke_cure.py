@@ -55,12 +55,14 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         reach = np.abs((seen.real, seen.imag)) + (1.0 - OVERHANG) * mirror.working_radius
         if not metres:
             beyond = "the lateral resolution of the maps is not known, so the aperture stays as it is: set pitch"
+        elif not (all(last.camera) and np.isfinite(centre)):
+            beyond = "where the aperture lies on the maps is not known, so it stays as it is"
         elif (reach > (middle + 0.5) * metres).any():
             beyond = (
                 "the maps end before the working aperture does when it is centred on the mirror: move the mirror or "
                 f"the camera by {-1e3 * seen.real:+.2f} mm in x and {-1e3 * seen.imag:+.2f} mm in y of the maps"
             )
-        elif np.isfinite(centre):
+        else:
             changes["interferometer"] |= {
                 "aperture.radius": mirror.working_radius,
                 "aperture.follow": follow,

@@ -24,6 +24,8 @@ STANDS_OUT = 2.0
 LOOPS_SHOW = 0.01
 #: Least size of a move as a divisor, m: maps at mid range have no move.
 NO_MOVE = 1e-15
+#: Singular values up to this share of the largest are noise, as of a dead actuator.
+LEAST_AUTHORITY = 0.01
 #: Factor from pokes to moves in use: these go up to twice as far, and loops widen with the distance, ...
 LOOPS_WIDEN = 2.0
 #: ... but to no more than this many times the allowance of a single actuator: all actuators err alike.
@@ -127,8 +129,9 @@ def loop_share(left: Floats, moved: Floats, weight: Floats, tested: Bools, allow
         allowance: share of an actuator's move by which it may miss.
     """
     size = np.maximum(rms(moved, weight), NO_MOVE)
+    tested = tested & (size > DEAD_SHARE * size.max())  # pokes of a dead actuator show noise
     along = np.abs((left[tested] * moved[tested]) @ weight) / (size * np.maximum.accumulate(size))[tested]
-    shown = float(np.percentile(along, 95.0))
+    shown = float(np.percentile(along, 95.0)) if tested.any() else 0.0
     return min(LOOPS_WIDEN * shown, LOOPS_WIDEST * allowance) if shown > LOOPS_SHOW else 0.0
 
 
@@ -138,7 +141,8 @@ def with_loops(error: float, share: float, influence_zernike: Floats, limits: Li
     Args:
         influence_zernike: (K, N).
     """
-    signals: Floats = np.asarray(np.linalg.pinv(influence_zernike[PISTON_TILT:])[:, 0], np.float64)  # a unit of defocus
+    inverse = np.linalg.pinv(influence_zernike[PISTON_TILT:], rcond=LEAST_AUTHORITY)
+    signals: Floats = np.asarray(inverse[:, 0], np.float64)  # a unit of defocus
     used = np.abs(signals).max() / limits.half_range
     apart = limits.differences(signals).max(initial=0.0) / limits.neighbour_difference
     if not (share and used):

@@ -48,7 +48,7 @@ class BumpCheck:
     def __init__(self, options: BumpOptions, mirror: Mirror, allowance: float) -> None:
         """`allowance`: error of actuators as a share of their moves."""
         self._options, self._allowance = options, allowance
-        self._rest, self._half_range = mirror.rest, mirror.limits.half_range
+        self._rest, self._half_range, self._radius = mirror.rest, mirror.limits.half_range, mirror.working_radius
         self._last: MapTaken | None = None
         self._moved = np.zeros_like(self._rest)
         # Sums of squares: change in the maps (rms, m) and commanded change. The root of their ratio is the response.
@@ -68,7 +68,7 @@ class BumpCheck:
         if self._last is not None and np.isfinite(record.coefficients).all():
             self._shown += _figure_rms(record.coefficients - self._last.record.coefficients) ** 2
             # A signal common to all actuators lifts the plate without bending it.
-            self._commanded += float(np.square(away - away.mean()).sum())
+            self._commanded += float(np.square(away - (away.mean() if len(away) > 1 else 0.0)).sum())
 
     def degaussed(self) -> None:
         """Note that all actuators went through their whole range."""
@@ -93,7 +93,8 @@ class BumpCheck:
                 f"(bump.tilt_max {options.tilt_max * 1e6:.2f} um)"
             )
         shift = math.dist(frame.centre, self._last.centre)
-        if options.shift_max and shift > max(options.shift_max, _WANDER_PX * frame.record.pitch):
+        pixel = self._radius / frame.record.radius_px if frame.record.radius_px > 0.0 else 0.0
+        if options.shift_max and shift > max(options.shift_max, _WANDER_PX * pixel):
             return (
                 f"the mirror moved by {shift * 1e3:.3f} mm on the map since {last.label} "
                 f"(bump.shift_max {options.shift_max * 1e3:.3f} mm)"

@@ -132,6 +132,8 @@ class Outcome:
     segment: int = 0
     centres: list[tuple[float, float]] = field(default_factory=list)
     _given_up: dict[int, int] = field(default_factory=dict)
+    # Each drop, and the number of records before it.
+    _drops: list[tuple[int, Dropped]] = field(default_factory=list)
     # Events since the last map: drops, and commands without a map.
     _failing: list[Dropped] = field(default_factory=list)
     _unseen: int = 0
@@ -153,6 +155,7 @@ class Outcome:
             case Dropped():
                 self.dropped.append(event.reason)
                 self._failing.append(event)
+                self._drops.append((len(self.records), event))
                 self._given_up[event.step] = self._given_up.get(event.step, 0) + (1_000_000 if event.whole else 1)
             case Solved():
                 if event.target not in self.targets:  # solved again after an interruption
@@ -193,6 +196,7 @@ class Outcome:
             del self.dropped[-len(self._failing) :]
             for drop in self._failing:
                 self._given_up.pop(drop.step, None)
+            del self._drops[-len(self._failing) :]
         if number and self._unseen:
             del self.records[-self._unseen :], self.centres[-self._unseen :]
         self.segment, self._failing, self._unseen = number, [], 0
@@ -202,7 +206,12 @@ class Outcome:
         self.dropped += [
             f"{record.label}: {event.reason}" for record in doubtful if np.isfinite(record.coefficients).any()
         ]
-        for record in doubtful:
-            self._given_up.pop(record.step, None)
+        # Maps that failed meanwhile may have failed for the same reason.
+        failed = [drop for before, drop in self._drops if before >= event.kept and not drop.whole]
+        for drop in failed:
+            self.dropped.remove(drop.reason)
+        for step in {record.step for record in doubtful} | {drop.step for drop in failed}:
+            self._given_up.pop(step, None)
+        self._drops = [each for each in self._drops if each[0] < event.kept or each[1].whole]
         del self.records[event.kept :], self.centres[event.kept :]
         self._failing, self._unseen = [], 0

@@ -64,8 +64,9 @@ def read_checks(file: Path) -> list[Check]:
     except OSError:
         return []
     kinds: list[Any] = [item.type for item in fields(Check)]
-    for row in csv.reader(lines[1:]):
-        with suppress(ValueError):
+    for line in lines[1:]:
+        with suppress(ValueError, csv.Error):
+            (row,) = csv.reader([line])
             check = Check(*(kind(value) for kind, value in zip(kinds, row, strict=True)))
             found += [check] if all(map(math.isfinite, astuple(check))) else []
     return sorted(found, key=lambda check: check.time)

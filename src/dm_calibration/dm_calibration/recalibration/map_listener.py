@@ -9,7 +9,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from dm_msgs.msg import ActuatorState, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
@@ -95,7 +94,7 @@ class MapListener:
             self._updates.folder = self._manager.store.folder
             try:
                 remark = self._updates.begin(calibration)
-            except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, without updates
+            except ValueError as error:  # use it all the same, without updates
                 remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
         if remark:
             self._node.get_logger().warning(remark)

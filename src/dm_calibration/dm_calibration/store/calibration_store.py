@@ -1,5 +1,6 @@
 """The folder of calibration files: written atomically, checked thoroughly when read."""
 
+import hashlib
 import re
 import time
 from collections.abc import Callable
@@ -108,7 +109,9 @@ class CalibrationStore:
         return noted if _ID.fullmatch(noted) else ""
 
     def _in_use(self, serial: str) -> Path:
-        return self.folder / f"in_use_{_stem(serial)}.txt"
+        stem = _stem(serial)  # of more than one serial number
+        mark = "" if stem == serial else f"-{hashlib.sha256(serial.encode()).hexdigest()[:8]}"
+        return self.folder / f"in_use_{stem}{mark}.txt"
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.

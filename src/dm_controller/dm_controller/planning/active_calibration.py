@@ -150,7 +150,7 @@ def active_calibration(
             from dm_common.hysteresis.law_shape import certain_limits  # not imported at the start
 
             certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
-    except (ValueError, np.linalg.LinAlgError) as error:
+    except ValueError as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     return ActiveCalibration(calibration, calibrated, certain, planner, book)
 

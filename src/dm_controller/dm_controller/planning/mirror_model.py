@@ -11,7 +11,7 @@ from dm_common import Bools, Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
-from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis, curvature_of_defocus, tilt_influence
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
 
 #: Weight of a coefficient relative to the sag beyond the terms. Large enough to act as an equality while the limits
@@ -60,6 +60,8 @@ class InfluenceModel:
     def __post_init__(self) -> None:
         terms, actuators = self.influence_zernike.shape
         points = len(self.sample_x)
+        if terms != len(TERMS):
+            raise ValueError(f"calibration: zernike_offset has {terms} terms, must have {len(TERMS)}")
         expected = {
             "zernike_offset": (terms,),
             "sample_y": (points,),
@@ -183,8 +185,9 @@ class CalibratedMirror:
             tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
             self.tilt = tilt if np.abs(tilt).max() > LEAST_TILT * response.max() else None
         self.matrix = self.rows(Shape(model.influence_zernike, model.influence_sag), self.tilt)
-        share = RIDGE_SHARE if response.all() else RIDGE_SHARE_STUCK
-        self.ridge = (share * float(np.median(response))) ** 2
+        moving = response[response > 0.0]
+        share = RIDGE_SHARE if len(moving) == len(response) else RIDGE_SHARE_STUCK
+        self.ridge = (share * float(np.median(moving) if len(moving) else 1.0)) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
