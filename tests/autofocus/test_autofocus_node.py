@@ -677,3 +677,20 @@ def test_the_vision_node_of_the_examples_focuses_on_what_it_detects() -> None:
     finally:
         rclpy.shutdown()
     assert [request.curvature for request in asked] == [OPTICS.curvature_for(1 / 12.0), OPTICS.curvature_for(0.0)]
+
+
+def test_a_damaged_image_does_not_end_tracking_but_a_camera_that_sends_no_others_does(
+    scene: FilmedScene, observer: Observer
+) -> None:
+    _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    damaged = Image(height=48, width=64, step=64, encoding="mono8", data=[0] * 3069)
+    for _ in range(20):
+        damaged.header.stamp = scene.node.get_clock().now().to_msg()
+        scene._image.publish(damaged)
+        time.sleep(0.05)
+    assert not result.done()
+    scene.encoding = "64FC1"
+    wait_until(result.done, 30, "the end")
+    assert result.result().result.error_code == ErrorCode.INVALID_ARGUMENT
+    assert "encoding = '64FC1'" in result.result().result.message

@@ -10,8 +10,8 @@ from typing import Any
 from dm_msgs.action import Autofocus
 
 from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, search_config
-from dm_autofocus.focus_probe import SharpnessSample, raw_image
-from dm_autofocus.images import exposure_fault, grey
+from dm_autofocus.focus_probe import SharpnessSample
+from dm_autofocus.images import exposure_fault, grey, raw_image
 from dm_autofocus.optics import depth_of_focus, distance_of
 from dm_autofocus.probe_action import ASKED, START_GRACE_S, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel

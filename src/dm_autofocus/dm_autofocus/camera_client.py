@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 
 from dm_autofocus.boresight import STEP, Boresight, find_boresight
-from dm_autofocus.focus_probe import IMAGES, raw_image
-from dm_autofocus.images import grey, pixels_of
+from dm_autofocus.focus_probe import IMAGES
+from dm_autofocus.images import grey, pixels_of, raw_image
 from dm_autofocus.sharpness import check_region, cut
 from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
 from dm_client.fields import filled

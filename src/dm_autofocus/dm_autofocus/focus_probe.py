@@ -2,10 +2,8 @@
 
 import math
 import statistics
-import sys
 import threading
 import time
-from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dm_autofocus.images import SettledGate, decompressed, grey
+from dm_autofocus.images import SettledGate, grey, raw_image
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
@@ -31,6 +29,9 @@ from dm_common.ros.clients import MirrorHolder, ServiceCallError
 #: Profile that cameras publish with; depth 1: an image that was not fetched in time is replaced by the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 
+#: Images in a row that cannot be used, as when a few bytes are lost, that do not end an action.
+DAMAGED_MAX = 2
+
 
 @dataclass(frozen=True)
 class SharpnessSample:
@@ -39,21 +40,6 @@ class SharpnessSample:
     sharpness: float
     image: Image
     regions: tuple[NDArray, ...]
-
-
-def raw_image(message: Image | CompressedImage) -> Image:
-    """The image itself, or what is in a compressed one. Raises ValueError when it cannot be decoded."""
-    if isinstance(message, Image):
-        return message
-    return image_message(message.header, *decompressed(bytes(message.data), message.format))
-
-
-def image_message(header: Any, pixels: NDArray, encoding: str, big_endian: bool = sys.byteorder == "big") -> Image:
-    """Pixels (H, W, ...) as an image."""
-    image = Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
-    image.step, image.is_bigendian = pixels.nbytes // image.height, int(big_endian)
-    image.data = array("B", pixels.tobytes())
-    return image
 
 
 class FocusProbe:
@@ -241,7 +227,7 @@ class FocusProbe:
         Raises:
             Refusal: no such image came in time, it cannot be used, or the user is to stop.
         """
-        samples, limit = list[SharpnessSample](), self._values["image_timeout"]
+        samples, damaged, limit = list[SharpnessSample](), 0, self._values["image_timeout"]
         with self._changed:
             self._fresh, self._measuring = None, True
         try:
@@ -255,8 +241,13 @@ class FocusProbe:
                     reason = self._gate.reason(newest, self._apart, limit, self._now())
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
                     raise Refusal(ErrorCode.TIMEOUT, text)
-                samples.append(self.sharpness_of(message, region))
-                self.counted += 1
+                try:
+                    samples.append(self.sharpness_of(message, region))
+                    damaged, self.counted = 0, self.counted + 1
+                except Refusal:
+                    damaged, self.dropped = damaged + 1, self.dropped + 1
+                    if damaged > DAMAGED_MAX:
+                        raise
         finally:
             self._measuring = False
         sharpness = statistics.median(sample.sharpness for sample in samples)

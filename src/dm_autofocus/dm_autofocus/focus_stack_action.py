@@ -11,9 +11,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from dm_autofocus.autofocus_parameters import tolerance_of
-from dm_autofocus.focus_probe import image_message
 from dm_autofocus.focus_stack import FEWEST, ImageStack
-from dm_autofocus.images import PLANAR, exposure_fault, grey, pixels_of
+from dm_autofocus.images import PLANAR, exposure_fault, grey, image_message, pixels_of
 from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE

@@ -2,11 +2,14 @@
 
 import io
 import math
+import sys
+from array import array
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sensor_msgs.msg import CompressedImage, Image
 
 
 @dataclass(frozen=True)
@@ -72,21 +75,38 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
     Raises:
         ValueError: it is no image that Pillow can read.
     """
-    from PIL import Image  # imported here: needed for compressed images only
+    import PIL.Image  # imported here: needed for compressed images only
 
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with PIL.Image.open(io.BytesIO(data)) as image:
             decoded = image if image.mode in MODES else image.convert("RGB")
             pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
             if decoded.mode == "I":
                 pixels = pixels.astype(np.uint16)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except PIL.UnidentifiedImageError as error:  # its text has an address in memory
+        raise ValueError(f"an image of the format {image_format!r} that is neither JPEG nor PNG") from error
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
         raise ValueError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
     mosaic = image_format.partition(";")[0].strip()
     layout = ENCODINGS.get(mosaic)
     if layout is not None and layout.green is not None and pixels.ndim == 2 and pixels.dtype == np.dtype(layout.type):
         encoding = mosaic  # the compressed image is the Bayer pattern of the sensor
     return pixels, encoding
+
+
+def raw_image(message: Image | CompressedImage) -> Image:
+    """The image itself, or what is in a compressed one. Raises ValueError when it cannot be decoded."""
+    if isinstance(message, Image):
+        return message
+    return image_message(message.header, *decompressed(bytes(message.data), message.format))
+
+
+def image_message(header: Any, pixels: NDArray, encoding: str, big_endian: bool = sys.byteorder == "big") -> Image:
+    """Pixels (H, W, ...) as an image."""
+    image = Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    image.step, image.is_bigendian = pixels.nbytes // image.height, int(big_endian)
+    image.data = array("B", pixels.tobytes())
+    return image
 
 
 def pixels_of(message: Any) -> NDArray:

@@ -19,6 +19,8 @@ WHOLE: Region = (0.0, 0.0, 1.0, 1.0)
 
 #: Most pixels that enter one figure; of larger regions only every n-th row is used.
 PIXEL_BUDGET = 400_000
+#: Smallest mean of grey levels, as a share of that of their sizes.
+CANCELLED = 0.5
 #: Smallest region [px along a side] that has a gradient.
 SMALLEST = 3
 
@@ -116,11 +118,17 @@ def _rows(image: NDArray, pixel_budget: int) -> tuple[NDArray, NDArray, NDArray]
 
 
 def _finite(image: NDArray) -> NDArray[np.float32]:
-    """As float32, non-finite numbers as black; floats scaled by a power of two to below 1, lest squares overflow."""
+    """As float32, non-finite numbers as black; floats scaled by a power of two to below 1, lest squares overflow.
+
+    Raises ValueError where their mean says nothing of the exposure, as after a background was subtracted.
+    """
     values = image.astype(np.float32)
     if image.dtype.kind != "f":
         return values
     np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    mean, size = (float(each.mean(dtype=np.float64)) for each in (values, np.abs(values)))
+    if mean < CANCELLED * size:
+        raise ValueError(f"grey levels below 0 cancel the others: their mean is {mean / size:.0%} of their mean size")
     return np.ldexp(values, -np.frexp(np.abs(values).max())[1])
 
 

@@ -97,6 +97,16 @@ def test_numbers_of_any_size_have_a_sharpness(scale: float) -> None:
     assert local_tenengrad(image * np.float32(scale), 8) == pytest.approx(local_tenengrad(image, 8))
 
 
+@pytest.mark.parametrize("offset", [-0.5, -0.49, -2.0])
+def test_grey_levels_that_cancel_are_refused(offset: float) -> None:
+    image = (texture() / 255.0).astype(np.float32)
+    image -= image.mean() - 0.5
+    for figure in (*METRICS.values(), lambda one: local_tenengrad(one, 8)):
+        assert np.isfinite(np.asarray(figure(image - np.float32(0.2)))).all()
+        with pytest.raises(ValueError, match="below 0 cancel the others"):
+            figure(image + np.float32(offset))
+
+
 def message(pixels: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> SimpleNamespace:
     height, width = pixels.shape[:2]
     rows = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")).reshape(height, -1).view(np.uint8)
@@ -166,8 +176,10 @@ def test_compressed_images_give_their_pixels(kind: str, file: str, image_format:
     assert read.dtype == (np.uint16 if encoding == "mono16" else np.uint8)
     np.testing.assert_allclose(read, pixels, atol=4 if file == "JPEG" else 0)
     if file == "PNG":
-        for broken in (written.getvalue()[:45], b"", b"nothing"):
-            with pytest.raises(ValueError, match="cannot be decoded"):
+        with pytest.raises(ValueError, match="cannot be decoded"):
+            decompressed(written.getvalue()[:45], image_format)
+        for broken in (b"", b"nothing"):
+            with pytest.raises(ValueError, match=r"is neither JPEG nor PNG$"):
                 decompressed(broken, image_format)
 
 

@@ -114,10 +114,9 @@ class DeformableMirrorClient(Connection):
     # --- what is known ---
 
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
-        """The latest message of `mirror_info`, `calibration`, `capabilities` or `actuator_state`.
-
-        Raises DeformableMirrorError when none came within the time.
-        """
+        """The latest message on one of TOPICS. Raises DeformableMirrorError for another, or when none came in time."""
+        if topic not in TOPICS:
+            raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, f"{topic!r}: must be one of {', '.join(TOPICS)}")
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")
         return self.messages[topic]

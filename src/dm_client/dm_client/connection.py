@@ -232,14 +232,14 @@ class Connection:
         Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel the goal, so that the mirror is left
         in a safe state; `identity`: see `run_goal`.
         """
-        failed = list[Exception]()
+        failed = list[BaseException]()
 
         def take(feedback: Any) -> None:
             self._servers[name].heard()  # feedback proves that the node lives, even if a busy machine missed its lease
             try:
                 if not failed:
                     on_feedback(feedback)
-            except Exception as error:  # raised in the executor it would end the whole process
+            except BaseException as error:  # raised in the executor it would end the whole process
                 failed.append(error)
 
         try:

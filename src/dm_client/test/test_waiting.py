@@ -75,7 +75,10 @@ def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (heard, feedback) == ([0], ["step 1"])
 
 
-def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit])
+def test_an_error_in_feedback_cancels_the_goal_and_is_raised(
+    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """rclpy's executor ends the whole process with it."""
     asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     asked._servers, asked.clients, asked._timeout_s = {"converge": THERE}, {"converge": None}, 1.0
@@ -89,12 +92,18 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(monkeypatch: pytest
         return Converge.Result(error_code=ErrorCode.CANCELED)
 
     def fail(feedback: object) -> None:
-        raise ZeroDivisionError(feedback)
+        raise error(feedback)
 
     monkeypatch.setattr(connection, "run_goal", run_goal)
-    with pytest.raises(ZeroDivisionError, match="step 1"):
+    with pytest.raises(error, match="step 1"):
         asked.run_action("converge", Converge.Goal(), fail, 1.0)
     assert cancelled == [False, True]
+
+
+def test_a_topic_that_it_does_not_hear_is_named() -> None:
+    with pytest.raises(DeformableMirrorError, match="'zernike': must be one of mirror_info, calibration") as refused:
+        client(ActuatorState.STATE_ACTIVE, ErrorCode.OK).latest("zernike")
+    assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 
 
 def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: int) -> None:

@@ -214,6 +214,8 @@ class DriverMonitor:
             ours = any(same_signals(report.requested, own) for own in (signals, last.signals))
             if ours and not report.moving:
                 return Progress(share=1.0, remaining=gap, stands=True)
+            if not ours and order.starts != self.starts:
+                return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver was restarted meanwhile"))
             if not ours and (last.confirmed or last.given_up):
                 return SUPERSEDED
         # Since its last command: a correction for creep may come long after the first.
@@ -245,4 +247,6 @@ class DriverMonitor:
             return Refusal(report.error_code, f"{text}: {report.message}")
         if self._heard < command.sent.steady:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
+        if stamp_ns(report.header.stamp) < command.sent.ns:
+            return Refusal(ErrorCode.TIMEOUT, f"{text}: it keeps the shape from before, nothing has reached it since")
         return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")

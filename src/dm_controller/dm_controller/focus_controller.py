@@ -146,7 +146,7 @@ class FocusController:
         The newest request wins.
         """
         self.requests += 1
-        order = Order(request, now)
+        order = Order(request, now, starts=self.monitor.starts)
         return order, self._attempt(order, now, dry_run)
 
     def judge(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:

@@ -77,6 +77,7 @@ class Order:
         checked: s, ROS time, of the last check for creep.
         stood: the order whose shape stays if the driver does not take the first command, until it has; None = none.
         kept: its move was not stopped.
+        starts: number of times that the driver had been activated anew when it was asked for.
     """
 
     request: FocusRequest
@@ -95,6 +96,7 @@ class Order:
     checked: float = 0.0
     stood: Order | None = None
     kept: bool = True
+    starts: int = 0
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
         """Another command for its shape, under the same holder."""

@@ -71,7 +71,8 @@ def test_a_command_that_is_confirmed_is_not_told_of() -> None:
 @pytest.mark.parametrize(
     ("last", "code", "text"),
     [
-        (report(), ErrorCode.PREEMPTED, "follows another one"),
+        (report(stamp_ns=2 * 10**9), ErrorCode.PREEMPTED, "follows another one"),
+        (report(stamp_ns=10**9 - 1), ErrorCode.TIMEOUT, "keeps the shape from before"),
         (report(error_code=ErrorCode.STALE, message="too old"), ErrorCode.STALE, "too old"),
         (report(driver_state=ActuatorState.STATE_INACTIVE), ErrorCode.DRIVER_INACTIVE, "not active"),
         (report(driver_state=ActuatorState.STATE_LINK_LOST), ErrorCode.ELECTRONICS_UNREACHABLE, "lost the link"),
@@ -95,7 +96,7 @@ def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_not
     driver = monitor(timeout=0.0)
     assert driver.untaken(BEGAN + 0.9 * CONFIRM_S) is None
     untaken = driver.untaken(BEGAN + 1.1 * CONFIRM_S)
-    assert untaken is not None and untaken.error_code == ErrorCode.PREEMPTED
+    assert untaken is not None and "nothing has reached it" in str(untaken)
     driver = monitor(timeout=0.0)
     assert driver.order is not None and driver.order.command is not None
     driver.order.command.sent = Moment(10**9, 1.0, BEGAN + 1.0)  # no report has come since
@@ -129,6 +130,19 @@ def test_a_command_that_a_driver_started_anew_cannot_know_is_lost_at_once(
     assert (untaken is not None) == lost
     if untaken is not None:
         assert untaken.error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(untaken)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "code", "text"),
+    [(8, ErrorCode.PREEMPTED, "another command took over"), (1, ErrorCode.DRIVER_UNAVAILABLE, "was restarted")],
+)
+def test_a_shape_that_a_restarted_driver_has_left_was_not_taken_over(sequence: int, code: int, text: str) -> None:
+    driver = monitor()
+    driver.observe(report(THERE, sequence=7), BEGAN + 0.1)
+    assert driver.order is not None and driver.progress(driver.order, BEGAN + 0.1).stands
+    driver.observe(report(np.zeros(37), sequence=sequence, stamp_ns=2 * 10**9), BEGAN + 0.5)
+    failed = driver.progress(driver.order, BEGAN + 0.5).failed
+    assert failed is not None and failed.error_code == code and text in str(failed)
 
 
 def test_the_latency_is_from_the_command_to_its_first_write() -> None:

@@ -286,6 +286,8 @@ class BenchServices:
             if requested.shape == self._commanded.shape and np.abs(requested - self._commanded).max() <= _SAME_SIGNAL:
                 return
             self.check_ready()
+            if self.hold.lost is not None:
+                raise self.hold.lost
             if time.monotonic() > deadline or self.cancelled():
                 raise Refusal(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
             time.sleep(0.01)
