@@ -87,3 +87,9 @@ def test_number_of_pixels_counts_those_beyond_the_map_too(x8: int, y8: int, radi
     x, y, radius = x8 / 8, y8 / 8, radius8 / 8
     expected = disc((60, 60), x + 20, y + 20, radius).sum()
     assert Aperture(x, y, radius).pixels() == expected
+
+
+@pytest.mark.parametrize("radius", [2e5, 1e8])
+def test_a_circle_beyond_any_camera_is_counted_without_its_pixels(radius: float) -> None:
+    """As when the lateral scale in a file is damaged: an array of these would not fit into memory."""
+    assert Aperture(30.0, 30.0, radius).pixels() == pytest.approx(np.pi * radius**2, rel=1e-6)

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration import calibrate, calibrator
-from dm_calibration.acquisition.ingest import IngestSettings
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.map_sources import outcome_of
 from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.excitation import excitation
@@ -121,8 +121,13 @@ def test_a_file_without_data_in_a_folder_wants_the_times(tmp_path: Path) -> None
     for number, sag in enumerate(seen(plant, inside, commands)):
         counts = np.where(inside & (number != 2), np.rint(sag / COUNT), NO_DATA).astype(np.int64)
         (tmp_path / f"{number}.dat").write_bytes(dat_bytes(counts, pitch=PITCH, time=1_700_000_000 + 5 * number))
-    with pytest.raises(ValueError, match="times: map 3 tells none"):
+    # It lies between the others; of the last one that is not known.
+    stamps = outcome_of(tmp_path, commands, None, mirror, hysteresis=True).maps().stamp_ns
+    assert list(np.diff(stamps[-4:]) / 1e9) == [5.0, 5.0, 5.0]
+    (tmp_path / "2.dat").rename(tmp_path / "9.dat")
+    with pytest.raises(ValueError, match="times: map 4 tells none"):
         outcome_of(tmp_path, commands, None, mirror, hysteresis=True)
+    (tmp_path / "9.dat").rename(tmp_path / "2.dat")
     times = 5.0 * np.arange(1, 5)
     outcome = outcome_of(tmp_path, commands, times, mirror, hysteresis=True)
     assert "none of the" in outcome.dropped[0] and outcome.dropped[0].startswith("map 3: ")
@@ -244,6 +249,9 @@ def test_measurements_and_what_is_refused() -> None:
         calibrate(sag, commands, np.full(len(sag), 1.7e18), mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match="times: map 1 tells none"):
         calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
+    since_1904 = time.time() + 2_082_844_800.0 + np.arange(len(sag))
+    with pytest.raises(ValueError, match=r"times go up to 3\.\d+e\+09 s, which lies ahead"):
+        calibrate(sag, commands, since_1904, mirror=mirror, settings=settings)
     with pytest.raises(ValueError, match="times: all are the same"):
         calibrate(sag, commands, np.zeros(len(sag)), mirror=mirror, settings=settings, hysteresis=True)
     times = np.arange(len(sag), dtype=float)
@@ -279,3 +287,23 @@ def test_measurements_and_what_is_refused() -> None:
 def test_an_empty_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no map file"):
         calibrate(tmp_path, np.zeros((1, 7)), mirror=make_mirror(rings=1))
+
+
+@pytest.mark.parametrize("told", [np.inf, np.nan, 1e15, 2e10, -5.0])
+def test_a_time_in_a_file_that_can_be_none_is_not_known(
+    told: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)[:1]
+    counts = np.where(inside, np.rint(seen(plant, inside, commands)[0] / COUNT), NO_DATA).astype(np.int64)
+    (tmp_path / "1.dat").write_bytes(dat_bytes(counts, pitch=PITCH))
+    read = Ingest.read
+
+    def damaged(ingest: Ingest, *arguments: Any) -> Any:
+        surface, measured = read(ingest, *arguments)
+        return replace(surface, time_stamp=told), measured
+
+    monkeypatch.setattr(Ingest, "read", damaged)
+    outcome = outcome_of(tmp_path, commands, None, mirror)
+    assert abs(outcome.records[0].stamp_ns - time.time_ns()) < 600e9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -122,6 +123,30 @@ def test_folder_that_vanishes_and_returns_loses_nothing(folder: Path) -> None:
     (folder / "new.dat").write_bytes(b"1")
     watch.poll(2)
     assert names(watch, 4) == ["new.dat"]
+
+
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="there is no second disk")
+def test_a_disk_that_is_mounted_later_or_again_brings_no_new_files(folder: Path) -> None:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as disk:
+        (Path(disk) / "old.dat").write_bytes(b"1")
+        place = folder.with_name("mount")
+
+        def mount(what: str | Path) -> None:
+            place.unlink(missing_ok=True)
+            place.symlink_to(what)
+
+        mount(folder)
+        watch = FolderWatch(place, ["*.dat"], STABLE)
+        assert watch.poll(0) == []
+        for now in (10, 20):
+            mount(disk)
+            assert names(watch, now) == names(watch, now + 2) == []
+            mount(folder)  # it is lost again
+            assert watch.poll(now + 4) == []
+        mount(disk)
+        (Path(disk) / "written_meanwhile.dat").write_bytes(b"1")
+        watch.poll(30)
+        assert names(watch, 32) == ["written_meanwhile.dat"]
 
 
 def test_closed_file_of_the_length_it_tells_is_taken_at_once(folder: Path) -> None:

@@ -153,6 +153,15 @@ def test_marks_on_a_line_are_refused(seen: np.ndarray, turned: bool) -> None:
         lateral_scale(np.hstack((places, seen) if turned else (seen, places)), (SIZE, SIZE))
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_marks_on_a_ring_tell_no_distortion(noise: float) -> None:
+    ring = np.exp(2j * np.pi * np.arange(8) / 8)
+    seen = 0.8 * 0.5 * SIZE * ring + RNG.normal(0.0, noise, (8, 2)) @ (1.0, 1j)
+    marks = np.column_stack((0.5 * (SIZE - 1) + seen.real, 0.5 * (SIZE - 1) - seen.imag, ring.real, ring.imag))
+    with pytest.raises(ValueError, match="do not tell scale from distortion"):
+        lateral_scale(marks, (SIZE, SIZE))
+
+
 def test_undistorted_is_where_it_is() -> None:
     distortion = 0.01
     share = np.ones_like(X)

@@ -172,10 +172,11 @@ class BoundedProgramme:
     def _least_distance(self, projected: Floats) -> Floats:
         """Problem LDP of [9]: the shortest y = R s - d that satisfies all constraints."""
         right = self._constraint_limits - self._constraints @ projected
-        system = np.vstack([self._constraints.T, right])
+        size = max(float(np.abs(right).max()), 1.0)  # a target far away: the distance would lose its digits
+        system = np.vstack([self._constraints.T, right / size])
         unit = np.zeros(len(system))
         unit[-1] = 1.0
         multipliers, _norm = nnls(system, unit, maxiter=20 * len(right))
         residual = system @ multipliers - unit
-        signals: Floats = solve_triangular(self._triangle, projected - residual[:-1] / residual[-1])
+        signals: Floats = solve_triangular(self._triangle, projected - size * residual[:-1] / residual[-1])
         return signals

@@ -1,5 +1,6 @@
 """Where nodes keep what they need at their next start."""
 
+import hashlib
 import os
 import re
 from pathlib import Path
@@ -13,6 +14,11 @@ def ros_home(place: str = "") -> Path:
 
 
 def state_file(folder: str, suffix: str, *names: object) -> Path | None:
-    """The file in `folder`, a node's `state_folder`, of what `names` identify; None for an empty folder name."""
-    stem = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", str(name)).strip("-.") for name in names)[:200] or "mirror"
-    return ros_home(folder) / f"{stem}{suffix}" if folder else None
+    """The file in `folder`, a node's `state_folder`, of what `names` identify; None for an empty folder name.
+
+    Names that are no file names are told apart by digits of their SHA-256.
+    """
+    told = "_".join(map(str, names))
+    stem = "_".join(re.sub(r"[^A-Za-z0-9._-]+", "-", str(name)).strip("-.") for name in names)[:200] or "mirror"
+    mark = "" if stem == told else f"-{hashlib.sha256(told.encode()).hexdigest()[:8]}"
+    return ros_home(folder) / f"{stem}{mark}{suffix}" if folder else None

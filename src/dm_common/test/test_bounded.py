@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import linprog, minimize
 
 from dm_common.bounded import BoundedProgramme
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
@@ -37,6 +37,20 @@ def test_metres_and_nanometres_give_the_same_signals() -> None:
     limits = Limits(-1, 1, chain(6), 0.5)
     metres = BoundedProgramme(1e-9 * matrix, limits, 1e-21).solve(1e-9 * wanted)
     np.testing.assert_allclose(metres, BoundedProgramme(matrix, limits, 1e-3).solve(wanted), atol=1e-8)
+
+
+@pytest.mark.parametrize("demand", [1e4, 1e6, 1e8])
+def test_wishes_far_beyond_reach_are_met_as_far_as_that_goes(demand: float) -> None:
+    """A wish so far away only counts by its direction: the signals are those that go furthest along it."""
+    generator = np.random.default_rng(3)
+    matrix, wanted = generator.normal(size=(30, 6)), demand * generator.normal(size=30)
+    limits = Limits(-1, 1, chain(6), 0.5)
+    signals = BoundedProgramme(matrix, limits).solve(wanted)
+    assert limits.allow(signals)
+    differences = np.diff(np.eye(6), axis=0)
+    along = wanted @ matrix
+    furthest = linprog(-along, np.vstack((differences, -differences)), np.full(10, 0.5), bounds=(-1, 1)).x
+    assert along @ signals >= along @ furthest * (1.0 - 10.0 / demand)
 
 
 @pytest.mark.slow

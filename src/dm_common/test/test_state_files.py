@@ -20,8 +20,19 @@ def test_ros_home_takes_the_place_of_the_usual_folder(monkeypatch: pytest.Monkey
 def test_names_cannot_lead_out_of_the_folder() -> None:
     path = state_file("/srv", ".shape", "usb_dac40", "../../etc/tty", "..", "S 7/é")
     assert path is not None and path.parent == Path("/srv")
-    assert state_file("/srv", ".creep.npz", "PDM 30/1") == Path("/srv/PDM-30-1.creep.npz")
-    assert state_file("/srv", ".creep.npz", "..") == Path("/srv/mirror.creep.npz")
+    for names, stem in (
+        (("PDM 30/1",), "PDM-30-1"),
+        (("..",), "mirror"),
+        (("usb_dac40", "/dev/tty"), "usb_dac40_dev-tty"),
+    ):
+        path = state_file("/srv", ".creep.npz", *names)
+        assert path is not None and path.match(f"/srv/{stem}-????????.creep.npz")
+
+
+def test_names_that_look_alike_as_files_are_told_apart() -> None:
+    names = ("A-1", "A/1", "A 1", "Ä", "Ж", "", "a_b")
+    assert len({state_file("/srv", ".creep.npz", name) for name in names}) == len(names)
+    assert state_file("/srv", ".creep.npz", "A-1") == Path("/srv/A-1.creep.npz")
 
 
 def test_no_folder_is_no_file() -> None:

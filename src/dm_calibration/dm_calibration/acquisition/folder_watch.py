@@ -56,6 +56,9 @@ class FolderWatch:
         self._stable_time = stable_time
         self._known: dict[str, _Candidate] | None = None
         self._ignored: set[str] = set()
+        # The disk that was listed last, and the known files of the others: one that is mounted later brings old files.
+        self._disk = 0
+        self._known_on: dict[int, dict[str, _Candidate]] = {}
 
     def ignore(self, path: Path) -> None:
         """Never report this file."""
@@ -69,7 +72,11 @@ class FolderWatch:
         Raises:
             OSError: the folder cannot be read now; the known files are kept.
         """
-        listed = self.signatures()
+        listed, disk = self.signatures(), self.folder.stat().st_dev
+        if disk != self._disk:
+            if self._known is not None:
+                self._known_on[self._disk] = self._known
+            self._disk, self._known = disk, self._known_on.pop(disk, None)
         if self._known is None:
             self._known = {name: _Candidate(signature, now, done=True) for name, signature in listed.items()}
         known = {name: candidate for name, candidate in self._known.items() if name in listed}

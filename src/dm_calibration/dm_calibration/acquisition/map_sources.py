@@ -29,6 +29,9 @@ Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 #: Unix times before this one, s, in 1973, count from any start.
 UNIX_MIN_S = 1e8
 
+#: Times further ahead than this are no Unix times, s (LabVIEW counts from 1904): clocks may differ by less.
+AHEAD_MAX_S = 86400.0
+
 #: Largest peak-to-valley sag of an array, m: a larger one indicates another unit.
 SAG_MAX = 1e-3
 
@@ -115,6 +118,8 @@ def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Float
     """`times` (M,) and `moved` (M,), s, as Unix times: if they count from any start, the last map is of the present."""
     taken, shapes = seconds_of(times, "times"), None if moved is None else seconds_of(moved, "moved")
     last = taken.max(initial=-np.inf)
+    if time.time() + AHEAD_MAX_S < last < TIME_MAX_S:  # beyond that it is no number of s
+        raise ValueError(f"times go up to {last:g} s, which lies ahead: must count from 1970, or from the first map")
     shift = time.time() - last if last < UNIX_MIN_S else 0.0
     return taken + shift, None if shapes is None else shapes + shift
 
@@ -173,9 +178,13 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     last = next((one for one in found if one is not None), None)
     if last is None:
         raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
+    told = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns}
     measured = []
-    for one in found:
-        last = without_map(last, stamp_ns=0).record if one is None else one
+    for number, one in enumerate(found):
+        # Files without data tell no time: it lies between those of the maps around it.
+        inside = bool(told) and min(told) < number < max(told)
+        at = round(np.interp(number, [*told], [*told.values()])) if inside else 0
+        last = without_map(last, stamp_ns=at).record if one is None else one
         measured.append(last)
     return measured, dropped
 
@@ -185,7 +194,9 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
     if isinstance(one, str | Path):
         surface, measured = ingest.read(Path(one), settings)
         # Not the modification time: for copies that is the time of copying.
-        return replace(measured, stamp_ns=round(1e9 * (surface.time_stamp or 0.0)), sha256=surface.sha256)
+        told = surface.time_stamp or 0.0  # NaN, or no time at all, in a damaged file: then none is known
+        known = 0.0 < told <= time.time() + AHEAD_MAX_S
+        return replace(measured, stamp_ns=round(1e9 * told) if known else 0, sha256=surface.sha256)
     sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data
     if sag.ndim != 2:
         raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")

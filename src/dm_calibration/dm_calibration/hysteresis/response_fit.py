@@ -124,8 +124,8 @@ def identify_response(
         raise ValueError("measured: nothing in it changes")
     if not size < np.inf:
         raise ValueError(f"measured reaches {np.abs(values[usable]).max():g}: too large to compute with")
-    if not candidates:
-        raise ValueError("candidates: must be at least one law")
+    if not candidates or candidates[0].own:
+        raise ValueError("candidates: must be at least one law, the first of them common to all actuators")
     _check_apart(signals)
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
     if brought.shape[1] > len(brought):

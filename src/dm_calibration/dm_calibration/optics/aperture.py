@@ -70,6 +70,8 @@ class Aperture:
 
     def pixels(self) -> int:
         """Number of pixel centres inside or on the circle, including those outside the map."""
+        if self.radius_px > 1e5:  # far beyond any camera: not worth the memory of a count
+            return round(math.pi * self.radius_px**2)
         rows = np.arange(
             math.ceil(self.centre_y_px - self.radius_px), math.floor(self.centre_y_px + self.radius_px) + 1
         )

@@ -105,7 +105,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
         squares += apart / ((n + 1) * (2 if m else 1))  # mean square over the disc
-        if n <= MAX_ORDER:  # the bound holds for these; retrace error and vibration affect them more than higher orders
+        if n <= MAX_ORDER:  # retrace error and vibration affect these more than higher orders
             judged += apart
             freedom += (2 if m else 1) * len(tests) - round(np.trace(resolved))
         worst = max(worst, *np.linalg.norm(inverse[: len(determined)], axis=1)[determined], 0.0)

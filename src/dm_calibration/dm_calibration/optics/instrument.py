@@ -26,6 +26,8 @@ LEFT_MAX = 3e-8
 LEFT_SHARE, LEFT_NOISE = 0.3, 3e-9
 #: Fewest maps, and fewest points of a grid: enough to leave residuals by which the result can be judged.
 MAPS_MIN, POINTS_MIN = 5, 8
+#: Bounds of scale and distortion from which on a grid says nothing of them: the largest that the node accepts.
+UNCERTAIN_MAX = 0.1
 
 
 def _axes(shape: tuple[int, ...]) -> tuple[Floats, Floats, float]:
@@ -144,7 +146,10 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     values, covariance, left = min(fits, key=lambda fit: fit[2])
     size = float(np.hypot(values[0], values[1]))
     along = values[:2] / size
-    bounds = 2.0 * np.sqrt((along @ covariance[:2, :2] @ along / size**2, covariance[4, 4]))
+    with np.errstate(invalid="ignore"):
+        bounds = 2.0 * np.sqrt((along @ covariance[:2, :2] @ along / size**2, covariance[4, 4]))
+    if not bounds.max() < UNCERTAIN_MAX:  # NaN too
+        raise ValueError("the marks do not tell scale from distortion: must lie at different distances from the middle")
     return LateralScale(size / half, float(values[4]), float(bounds[0]), float(bounds[1]), left)
 
 

@@ -35,7 +35,7 @@ class SettledState:
 
 
 class AppliedHistory:
-    """Recent states of the mirror under one hysteresis model; every method is thread-safe.
+    """Recent states of the mirror under one hysteresis model; thread-safe, but for `follow`.
 
     Attributes:
         observer: of the mirror.

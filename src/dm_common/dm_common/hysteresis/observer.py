@@ -153,7 +153,7 @@ class Observed(NamedTuple):
 
 
 class HysteresisObserver:
-    """Follows one mirror under the law in use. May be asked from any thread.
+    """Follows one mirror under the law in use. May be asked from any thread, but not while the law is exchanged.
 
     Attributes:
         law: the law that is followed; the linear one where no hysteresis was identified.
