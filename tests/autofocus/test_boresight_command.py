@@ -108,3 +108,7 @@ def test_the_shift_of_a_picture() -> None:
         moved = spectrum * np.exp(-2j * np.pi * (columns * right + rows * down))
         before, after = (500 + 10 * np.fft.irfft2(part, (96, 128)) for part in (spectrum, moved))
         np.testing.assert_allclose(image_shift(before, after), (right, down), atol=0.15 + 0.05 * abs(right))
+        after[5, 7] = np.nan
+        np.testing.assert_allclose(image_shift(before, after), (right, down), atol=0.15 + 0.05 * abs(right))
+    with pytest.raises(ValueError, match="the image is black"):
+        image_shift(before, np.zeros_like(before))

@@ -59,8 +59,17 @@ def test_an_id_or_a_file_anywhere_is_found(
     with pytest.raises(ValueError, match="calibrate first"):
         find_calibration("", elsewhere)
     monkeypatch.setattr(verb, "running_calibration", lambda _namespace: (None, JUDGED_BY, ""))
-    monkeypatch.setattr(verb, "STORES", (tmp_path / "bench", tmp_path / "hardware"))
-    with pytest.raises(ValueError, match=r"bench or .*hardware: calibrate first"):
+    monkeypatch.setattr(verb, "VIRTUAL", tmp_path / "bench")
+    monkeypatch.setattr(verb, "HARDWARE", tmp_path / "hardware")
+    with pytest.raises(ValueError, match=r"bench/calibrations or .*hardware: calibrate first"):
         report("", tmp_path / "out")
+    # Another mirror's calibration is not that of a namespace, which has a folder of its own.
+    CalibrationStore(tmp_path / "bench" / "calibrations").save(store.load("older"))
+    CalibrationStore(tmp_path / "bench" / "left" / "calibrations").save(store.load("newer"))
+    for namespace, name in (("", "older"), ("/left", "newer")):
+        report("", tmp_path / "out", namespace=namespace, json=tmp_path / "figures.json")
+        assert json.loads((tmp_path / "figures.json").read_text())["id"] == name
+    with pytest.raises(ValueError, match=r"bench/right/calibrations or .*hardware: calibrate first"):
+        report("", tmp_path / "out", namespace="right")
     with pytest.raises(ValueError, match="no such file"):
         find_calibration("older", elsewhere)

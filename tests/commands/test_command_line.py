@@ -177,7 +177,8 @@ def test_what_is_next_is_said_for_the_mirror_that_was_asked(capsys: pytest.Captu
     assert left == f"next: ./dm check {there} --forget, ./dm focus {there} 0.02; if not, ./dm up --config f.yaml"
     parsed(*left.split("./dm ")[2].split(";")[0].split())
     there = "ros2 lifecycle set /left/pdm_driver activate, then ./dm doctor --namespace left again; ./dm exec true"
-    assert output.in_namespace(there.replace("/left", "").replace(" --namespace left", ""), "left") == there
+    for namespace in ("left", "/left", "left/"):
+        assert output.in_namespace(there.replace("/left", "").replace(" --namespace left", ""), namespace) == there
     assert (
         output.in_namespace("lifecycle set /left/pdm_driver activate", "left")
         == "lifecycle set /left/pdm_driver activate"
@@ -375,6 +376,11 @@ def test_a_suite_that_is_started_twice_is_named(tmp_path: Path, monkeypatch: pyt
                 pass
     with only_suite("left"):
         pass
+    monkeypatch.setenv("ROS_DOMAIN_ID", "")  # to ROS the same as 0
+    with only_suite("left"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", "0")
+        with pytest.raises(RuntimeError, match="domain 0, namespace /left"), only_suite("left"):
+            pass
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+import typer
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.msg import ActuatorState
@@ -32,7 +33,9 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_simulation.interferometer.zygo_files import encode_dat
+from dm_tools import output
 from dm_tools.doctor import bench as doctor_bench
+from dm_tools.doctor import doctor as doctor_verb
 from dm_tools.doctor import electronics
 from dm_tools.doctor import machine as doctor_machine
 from dm_tools.doctor.doctor import held_by_the_nodes
@@ -226,6 +229,7 @@ def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
     elsewhere = (
         *("must be one of", "must be {low} to {high}", "max_code", "must be finite", "leaves unconnected", "no camera"),
         *("path {", "px of an image", "must stay", "roi.x_offset"),
+        *("search.tolerance", "grey levels below 0"),  # of a mirror's range, and of images
     )
     missed = []
     for file in sorted({file for file, _ in reached if "/src/" in file}):
@@ -290,6 +294,18 @@ def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
     found = {name: run() for name, run in doctor_bench.bench_checks(tmp_path / "bench.yaml")}
     gone = found["electronics at PYRO:Mirror@127.0.0.1:9"]
     assert gone is not None and "cannot open deformable mirror at PYRO:Mirror@127.0.0.1:9" in gone.problem
+
+
+def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed() -> None:
+        raise PermissionError(13, "Permission denied", "/home/other/maps")
+
+    checks = [("watch_folder", closed), ("nodes that are running", lambda: Finding("none", "", note=True))]
+    monkeypatch.setattr(doctor_verb, "machine_checks", lambda _namespace: checks)
+    with output.console.capture() as said, pytest.raises(typer.Exit):
+        doctor_verb.doctor()
+    assert "WRONG watch_folder: cannot be checked:" in said.get() and "/home/other/maps" in said.get()
+    assert "none" in said.get()
 
 
 def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
@@ -431,7 +447,7 @@ def test_dds_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: 
     assert finding is not None and "no Fast DDS profile" in finding.problem
 
 
-@pytest.mark.parametrize(("value", "well"), [("7", True), ("102", False), ("-1", False), ("bench", False)])
+@pytest.mark.parametrize(("value", "well"), [("7", True), ("", True), ("102", False), ("-1", False), ("bench", False)])
 def test_domains(monkeypatch: pytest.MonkeyPatch, value: str, well: bool) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
     monkeypatch.delenv("ROS_LOCALHOST_ONLY", raising=False)

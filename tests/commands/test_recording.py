@@ -429,6 +429,13 @@ def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain
     assert bag.topics["/mirror_info"].type_hash.startswith("RIHS01_")
 
 
+def test_a_recording_that_cannot_begin_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "bench")
+    with pytest.raises(RuntimeError, match="failed to initialize rcl"):
+        Recorder(tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
 def test_of_two_mirrors_only_the_one_that_is_named_is_recorded(observer: Observer, domain: int, tmp_path: Path) -> None:
     """And what they share; the one that is not named may be without a namespace."""
     for name in ("actuator_state", "left/actuator_state", "right/actuator_state"):

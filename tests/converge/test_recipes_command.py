@@ -22,7 +22,7 @@ def test_a_list_or_a_range() -> None:
     assert curvatures_of("-0,05:0,05:11") == curvatures_of("-0.05:0.05:11")
 
 
-@pytest.mark.parametrize("text", ["a", "0:1", "0:1:1", "0:1:x", "0:1:3:4"])
+@pytest.mark.parametrize("text", ["a", "0:1", "0:1:1", "0:1:x", "0:1:3:4", "0,02", ",", "nan", "nan:1:3", "0:inf:3"])
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(typer.BadParameter, match=f"curvatures = {text!r}"):
         curvatures_of(text)

@@ -56,6 +56,7 @@ class AutofocusNode(ManagedNode):
         self._optics = focus_optics(self._values)
         self._probe.subscribe()
         self._timer.cancel()
+        self._image_problem, self._watched = "", None
         if rate := self._values["monitor_rate"]:
             self._timer.timer_period_ns = round(1e9 / rate)
             self._timer.reset()

@@ -92,15 +92,28 @@ def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
     return FocusOptics.from_rest_distance(values["optics.rest_distance"], **others)
 
 
+#: Fewest and most of the finest steps in a range: time and memory of a search grow with their number.
+STEPS_MIN, STEPS_MAX = 4, 4000
+
+
 def tolerance_of(values: Mapping[str, Any], aperture_radius: float) -> float:
     """Finest step of curvature [1/m]: as configured, else the depth of focus of the calibrated aperture."""
     return float(values["search.tolerance"]) or depth_of_focus(aperture_radius, values["optics.wavelength"])
 
 
 def search_config(values: Mapping[str, Any], aperture_radius: float, low: float, high: float) -> SearchConfig:
-    """The search of a range of curvatures [1/m]. Raises ValueError if the aperture has no radius."""
-    tolerance = tolerance_of(values, aperture_radius)
-    points = max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance)))
+    """The search of a range of curvatures [1/m].
+
+    Raises:
+        ValueError: the aperture has no radius, or `search.tolerance` does not suit the range.
+    """
+    tolerance, span = tolerance_of(values, aperture_radius), high - low
+    if values["search.tolerance"] and not span / STEPS_MAX <= tolerance <= span / STEPS_MIN:
+        raise ValueError(
+            f"search.tolerance = {tolerance:g} 1/m: must be {span / STEPS_MAX:.2g} to {span / STEPS_MIN:.2g} for a "
+            f"range of {low:+.4f} to {high:+.4f} 1/m, or 0 (the depth of focus)"
+        )
+    points = max(NOISE_POINTS, 1 + math.ceil(span / (values["search.coarse_step"] * tolerance)))
     return from_values(SearchConfig, values, "search.", low=low, high=high, tolerance=tolerance, coarse_points=points)
 
 

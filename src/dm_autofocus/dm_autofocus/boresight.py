@@ -51,7 +51,13 @@ class Boresight:
 
 
 def image_shift(before: NDArray, after: NDArray) -> Floats:
-    """(2,) px to the right and down by which the picture has moved between two images (H, W)."""
+    """(2,) px to the right and down by which the picture has moved between two images (H, W).
+
+    Raises ValueError for a black image; numbers that are not finite count as black.
+    """
+    before, after = (np.nan_to_num(image.astype(float), posinf=0.0, neginf=0.0) for image in (before, after))
+    if not (before.mean() > 0.0 and after.mean() > 0.0):
+        raise ValueError("the image is black")
     window = np.outer(*(np.hanning(side + 2)[1:-1] for side in before.shape))
     first, second = (np.fft.rfft2((image / image.mean() - 1) * window) for image in (before, after))
     cross = second * first.conj()

@@ -77,3 +77,12 @@ def test_a_short_range_is_swept_with_points_enough_to_tell_a_hill_from_noise() -
     assert search_config(values, 0.011, 0.0, 1e-4).coarse_points == 11
     with pytest.raises(ValueError, match=r"aperture_radius = 0.0 m: must be above 0"):
         search_config(values, 0.0, 0.0, 0.01)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 2e-5, 0.03, 1.0])
+def test_steps_that_do_not_suit_the_range_are_refused(tolerance: float) -> None:
+    """With 1e-6 a search took gigabytes, with more than the range it ended after two images."""
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    with pytest.raises(ValueError, match=r"search.tolerance = .*: must be 2.5e-05 to 0.025 for a range of -0.0500"):
+        search_config(values | {"search.tolerance": tolerance}, 0.011, -0.05, 0.05)
+    assert search_config(values | {"search.tolerance": 1e-3}, 0.011, -0.05, 0.05).tolerance == 1e-3

@@ -70,7 +70,7 @@ def test_values_that_ros_does_not_read_are_named(tmp_path: Path, value: str, sai
         load_config(file)
 
 
-@pytest.mark.parametrize("text", ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "'7e-3'", "e5", "7e"])
+@pytest.mark.parametrize("text", ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "'7e-3'", "e5", "7e", "2024-01-05"])
 def test_numbers_are_what_ros_takes_for_one(tmp_path: Path, text: str) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(f"/**/pdm_driver: {{ros__parameters: {{mirror.pitch: {text}}}}}\n")

@@ -11,6 +11,7 @@ from typing import Any
 
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -212,7 +213,7 @@ class Connection:
         A node just started may lose a request: with `again`, for requests that may be carried out twice, it is sent
         again once an answer that should come at once is late.
         """
-        with self._answered(name) as gone:
+        with self._answered(name, ActionClient) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
             again_s = self._timeout_s if again else math.inf
             response = call(self.clients[name], request, timeout_s, gone, again_s, ready_s=self._timeout_s)
@@ -243,7 +244,7 @@ class Connection:
                 failed.append(error)
 
         try:
-            with self._answered(name) as gone:
+            with self._answered(name, Client) as gone:
                 result = run_goal(
                     self.clients[name],
                     goal,
@@ -260,14 +261,18 @@ class Connection:
         return checked(result)
 
     @contextmanager
-    def _answered(self, name: str) -> Iterator[Callable[[], str]]:
-        """Raise DeformableMirrorError if `name` does not answer; yields a function: why its node is gone since now."""
+    def _answered(self, name: str, other: type) -> Iterator[Callable[[], str]]:
+        """Raise DeformableMirrorError if `name`, whose client is no `other`, does not answer.
+
+        Yields a function: why its node is gone since now.
+        """
         self._check_open()
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
             raise DeformableMirrorError(ErrorCode.BUSY, text)
-        if name not in self.clients:
-            text = f"{name!r}: must be one of {', '.join(self.clients)}"
+        named = [each for each, client in self.clients.items() if not isinstance(client, other)]
+        if name not in named:
+            text = f"{name!r}: must be one of {', '.join(named)}"
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         server = self._servers[name]
         server.wait_for_return()

@@ -106,6 +106,15 @@ def test_a_topic_that_it_does_not_hear_is_named() -> None:
     assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 
 
+def test_services_and_actions_are_not_taken_for_each_other(domain: int) -> None:
+    with DeformableMirrorClient(domain=domain) as mirror:
+        with pytest.raises(DeformableMirrorError, match=r"'move_focus': must be one of .*set_focus") as called:
+            mirror.call("move_focus", None)
+        with pytest.raises(DeformableMirrorError, match=r"'set_focus': must be one of .*move_focus") as run:
+            mirror.run_action("set_focus", None, print, 1.0)
+        assert called.value.error_code == run.value.error_code == ErrorCode.UNKNOWN_NAME
+
+
 def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: int) -> None:
     waits = [
         lambda mirror: mirror.focus(0.01),
@@ -146,8 +155,12 @@ def test_who_waits_hears_that_rclpy_was_shut_down(domain: int) -> None:
 
 def test_a_name_that_is_not_served_is_refused(domain: int) -> None:
     with DeformableMirrorClient(domain=domain) as mirror:
-        for ask in (lambda: mirror.call("nonsense", None), lambda: mirror.run_action("nonsense", None, print, 1.0)):
-            with pytest.raises(DeformableMirrorError, match=r"'nonsense': must be one of .*, hold_mirror") as refused:
+        asked = [
+            (lambda: mirror.call("nonsense", None), "hold_mirror, measure"),
+            (lambda: mirror.run_action("nonsense", None, print, 1.0), "degauss, calibrate, move_focus"),
+        ]
+        for ask, names in asked:
+            with pytest.raises(DeformableMirrorError, match=f"'nonsense': must be one of .*{names}") as refused:
                 ask()
             assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 

@@ -107,6 +107,7 @@ def fail(message: str) -> None:
 
 def in_namespace(text: str, namespace: str) -> str:
     """Add the namespace to each command in `text` that talks to running nodes."""
+    namespace = namespace.strip("/")
     if not namespace:
         return text
     text = re.sub(rf"lifecycle set /(?!{namespace}/)", f"lifecycle set /{namespace}/", text)

@@ -42,7 +42,7 @@ def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:
 
 def where(client: DeformableMirrorClient) -> str:
     """The ROS domain and namespace that the client looks at."""
-    return f"in the ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}, namespace {client.node.get_namespace()}"
+    return f"in the ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'}, namespace {client.node.get_namespace()}"
 
 
 @contextmanager

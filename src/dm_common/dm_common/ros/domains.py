@@ -33,7 +33,7 @@ def holders(targets: Collection[Path]) -> list[str]:
             if any(link.readlink() in targets for link in (process / "fd").iterdir()):
                 command = (process / "cmdline").read_text(errors="replace").split("\0")[:3]
                 variables = (process / "environ").read_text(errors="replace").split("\0")
-                domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID", "0")
+                domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID") or "0"
                 found.append(f"{' '.join(command).strip()[:COMMAND_MAX]} (process {process.name}, ROS domain {domain})")
     return found
 

@@ -28,7 +28,11 @@ def doctor(
         checks += bench_checks(config, namespace)
     findings: dict[str, Finding | None] = {}
     for name, run in checks:
-        findings[name] = finding = held_by_the_nodes(name, run(), findings.get("nodes that are running"))
+        try:
+            found = run()
+        except OSError as error:  # such as a folder in one that this user may not search
+            found = Finding(f"cannot be checked: {error}", "give this user the right to it, or choose another place")
+        findings[name] = finding = held_by_the_nodes(name, found, findings.get("nodes that are running"))
         if finding is None or not finding.cure:
             console.print("[green]ok[/]   ", end=" ")
             console.print(f"{name}: {finding.problem}" if finding else name, soft_wrap=True, markup=False)

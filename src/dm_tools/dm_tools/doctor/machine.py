@@ -105,7 +105,7 @@ def shared_memory() -> Finding | None:
 
 
 def domain() -> Finding | None:
-    text = os.environ.get("ROS_DOMAIN_ID", "0")
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not (text.isdecimal() and int(text) <= DOMAIN_MAX):
         return Finding(f"ROS_DOMAIN_ID = {text!r}: must be 0 to {DOMAIN_MAX}", "export ROS_DOMAIN_ID=0")
     if os.environ.get("ROS_LOCALHOST_ONLY") not in (None, "", "0"):

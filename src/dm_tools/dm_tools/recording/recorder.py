@@ -69,15 +69,15 @@ class Recorder:
         self._namespace = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
         self._wanted = {name if name.startswith("/") else self._namespace + name for name in topics}
         self._maps = maps
-        self._bag = BagWriter(folder)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()  # of the writer; None = the end
         self._failure: Exception | None = None
         self._stopping = False
-        self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
-        self._writer.start()
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
+        self._bag = BagWriter(folder)  # once ROS has started: else it would leave a folder
+        self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
+        self._writer.start()
         self._subscribed: set[str] = set()
         self._clients: dict[str, AsyncParameterClient] = {}
         # By publisher of a node's parameter events: when to ask it again (monotonic, s); when it was first seen, ns.

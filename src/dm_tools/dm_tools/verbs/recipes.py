@@ -1,5 +1,6 @@
 """`dm recipes`: build recipes on the bench, and list those of the calibration in use."""
 
+import math
 from typing import Annotated, Any
 
 import typer
@@ -26,11 +27,16 @@ def curvatures_of(text: str) -> list[float]:
     parts = (with_point(text) if ":" in text else text).split(":")
     try:
         if len(parts) == 1:
-            return [float(part) for part in text.split(",") if part.strip()]
+            listed = [float(part) for part in text.split(",") if part.strip()]
+            if not listed or not all(map(math.isfinite, listed)) or max(map(abs, listed)) >= 1.0:  # such as 0,02
+                raise ValueError
+            return listed
         first, last, number = float(parts[0]), float(parts[1]), int(parts[2])
     except (ValueError, IndexError) as error:
-        raise typer.BadParameter(f"curvatures = {text!r}: must be like -0.02,0,0.02 or like {DEFAULT}") from error
-    if len(parts) != 3 or not 2 <= number <= 1000:
+        raise typer.BadParameter(
+            f"curvatures = {text!r}: must be like -0.02,0,0.02, within 1 1/m, or like {DEFAULT}"
+        ) from error
+    if len(parts) != 3 or not (2 <= number <= 1000 and math.isfinite(first) and math.isfinite(last)):
         raise typer.BadParameter(f"curvatures = {text!r}: first:last:number, with 2 to 1000 of them")
     step = (last - first) / (number - 1)
     return [round(first + k * step, 12) for k in range(number)]

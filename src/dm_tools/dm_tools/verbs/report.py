@@ -15,8 +15,8 @@ from dm_tools.output import JsonOption, NamespaceOption, console, next_step, wri
 from dm_tools.parameter_changes import get_parameter
 from dm_tools.running_suite import BUSY_S, FIND_S, heard, nodes_of_suite
 
-#: Stores of the node `calibration`: that of the shipped virtual bench, and the default.
-STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
+#: Folder of the shipped virtual bench, and the default store of the node `calibration`.
+VIRTUAL, HARDWARE = Path("~/.ros/dm_bench"), Path("~/.ros/dm_calibrations")
 
 
 def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], str]:
@@ -104,9 +104,11 @@ def report(
     file_in_use, values, serial = running_calibration(namespace)
     if store is None:
         calibration = calibration or str(file_in_use or "")
-        store = folder_with(calibration, STORES if file_in_use is None else (file_in_use.parent, *STORES))
+        # A mirror of several on the virtual bench has a folder of its own (`virtual_mirror` in verbs/up.py).
+        usual = [VIRTUAL / namespace.strip("/") / "calibrations", HARDWARE]
+        store = folder_with(calibration, usual if file_in_use is None else [file_in_use.parent, *usual])
         if not (calibration or any(store.expanduser().glob("*.h5"))):
-            folders = " or ".join(str(folder) for folder in STORES)
+            folders = " or ".join(map(str, usual))
             raise ValueError(f"no calibration in {folders}: calibrate first (./dm calibrate), or name its --store")
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:

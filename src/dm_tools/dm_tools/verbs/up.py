@@ -123,7 +123,7 @@ def up(
 @contextlib.contextmanager
 def only_suite(namespace: str) -> Iterator[None]:
     """Lock this ROS domain and namespace for one suite. Raises RuntimeError when another suite has the lock."""
-    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     folder = ros_home()
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"dm_up.{domain}.{namespace.replace('/', '.')}").open("a+") as place:
