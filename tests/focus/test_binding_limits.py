@@ -131,3 +131,13 @@ def test_a_recipe_beyond_the_limits_is_commanded_inside_them_without_hysteresis_
         move = plans.plan(FocusTarget(0.05), state, 0.0, effective=share * inside, error=1e-9)
         assert plans.mirror.limits.allow(move.signals)
         assert (share * inside == move.signals).all() == (move.max_zernike <= 1e-9) == (share == 1.0)
+
+
+def test_what_a_recipe_corrects_is_no_error_that_limits_leave() -> None:
+    plans, target = active_calibration(calibration(), mirror_info()).planner, FocusTarget(0.03)
+    corrected = plans.mirror.command(target)[0] + 0.02 * np.random.default_rng(1).standard_normal(ACTUATORS)
+    assert plans.mirror.predict(target, corrected).max_zernike > 20e-9
+    move = plans.plan(target, plans.law.demagnetised(ACTUATORS, 0.0), 0.0, effective=corrected, error=40e-9)
+    np.testing.assert_array_equal(move.signals, corrected)
+    assert move.max_zernike == pytest.approx(move.plan.max_zernike) and move.max_zernike < 0.1e-9
+    assert move.plan.max_zernike_upper >= 40e-9 - 0.1e-9 and not move.plan.saturated.any()

@@ -230,7 +230,7 @@ def test_a_call_that_waits_for_the_driver_keeps_no_other_waiting(bench: Bench) -
         wait_until(lambda: len(bench.commands) == 1)
         assert bench.set_focus(curvature=0.02, dry_run=True).error_code == ErrorCode.OK
         assert not waiting.done()
-        assert waiting.result(60.0).error_code == ErrorCode.PREEMPTED
+        assert waiting.result(60.0).error_code == ErrorCode.TIMEOUT
 
 
 def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_is_active_again(bench: Bench) -> None:
@@ -295,8 +295,8 @@ def test_a_command_that_the_driver_does_not_take_is_told_of(bench: Bench) -> Non
     answer = bench.set_focus(curvature=0.01)
     told = wait_until(lambda: [s for s in bench.focus_states if s.error_code != ErrorCode.OK], 60)[0]
     assert told.curvature == 0.01 and not (told.applied or answer.state.applied)
-    assert told.error_code == answer.error_code == ErrorCode.PREEMPTED
-    assert "has not confirmed the command" in told.message
+    assert told.error_code == answer.error_code == ErrorCode.TIMEOUT
+    assert "has not confirmed the command: it keeps the shape from before" in told.message
 
 
 def test_requests_are_refused_when_the_driver_falls_silent(bench: Bench) -> None:

@@ -281,6 +281,17 @@ def test_dead_actuator_and_exchanged_pair() -> None:
     assert findings == ("actuator 13 shows no response above the noise", "actuators 3 and 7 are exchanged")
 
 
+def test_actuators_beside_a_displaced_aperture_are_not_called_dead() -> None:
+    silent = np.arange(37) == 22
+    quiet, pose = check(response(*stand(0.0, False, 1.2e-3 - 0.5e-3j)), silent=silent).findings
+    assert (
+        quiet
+        == "actuator 23 shows no response above the noise in the maps as they are now: check again once they "
+        + ("are corrected")
+    )
+    assert "the maps show the mirror shifted by" in pose
+
+
 def test_a_response_like_no_actuator_is_named() -> None:
     measured = response()
     measured[:, 3] = 1e-6 * np.sin(25.0 * PLANT.points.x)

@@ -140,14 +140,16 @@ class Planner:
             TargetError: no such surface exists over the aperture.
         """
         mirror, law = self.mirror, self.law
-        cut = False
+        cut, own = False, None
         if effective is None:
             found = self._closed_form.find(target)
             aim, largest = found or mirror.command(target)
             # The limits are those of signals, not of effective ones: from this state more or less may be in reach.
             cut = found is None and bool(mirror.limits.at_limit(aim).any())
         else:
-            aim, largest = effective, mirror.predict(target, effective).max_zernike
+            # What a recipe corrects is an error of the model and none of the mirror: the limits leave what they leave
+            # of the model's own signals, and what they deny the recipe's.
+            aim, (own, largest) = effective, mirror.command(target)
         if error is not None:
             largest = min(largest, error)
         if state is None:
@@ -166,11 +168,11 @@ class Planner:
                 reached = aim - missed
                 largest = mirror.predict(target, reached).max_zernike
             else:
-                denied = self._largest(missed)
+                denied, own = self._largest(missed), None if own is None else own - missed
                 largest, error = largest + denied, None if error is None else error + denied
 
         def predict() -> Plan:
-            plan = mirror.predict(target, reached)
+            plan = mirror.predict(target, reached if own is None else own)
             if error is not None:
                 plan = replace(plan, max_zernike=largest)
             creep = None

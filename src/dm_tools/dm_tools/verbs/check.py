@@ -47,13 +47,14 @@ def check(
         raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
         health = hear_health(client)
-        response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
-        calibration = client.latest("calibration")
-        # The bound of the present shape, not the one that the calibration promises for any shape. Its predicted part
-        # is subtracted, because the map is compared with the prediction.
+        # The bound of the present shape as it was promised before the map, which may widen it, and not the one that the
+        # calibration promises for any shape. Its predicted part is subtracted, because the map is compared with the
+        # prediction.
         patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
         client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
-    shape, capabilities = settled_shape(health), client.messages.get("capabilities")
+        shape, capabilities = settled_shape(health), client.messages.get("capabilities")
+        response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
+        calibration = client.latest("calibration")
     # The map is compared by the history known to the node `calibration`, which may have run for longer.
     lost = unknown_history(capabilities)
     if lost or capabilities is None:  # the promise of a focus controller that knew as much as that node
