@@ -25,6 +25,8 @@ SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
 #: Default of `calibrated_error_max`: a mirror counts as calibrated if its promise is no larger, m; about wavelength/20.
 CALIBRATED_ERROR_MAX = 32e-9
+#: Beginning of limitations that are findings of the poke check.
+POKE_CHECK = "Poke check: "
 
 _POINTS = ("x", "y", "weight")
 #: Fields whose attribute in the file has another name.
@@ -105,7 +107,7 @@ class Calibration:
             numbers = np.flatnonzero(self.fit.grades == grade) + 1
             if numbers.size:
                 reasons.append(f"actuators {', '.join(map(str, numbers))} are {GRADE_NAMES[grade]}")
-        if self.promise > error_max:
+        if not self.promise <= error_max:  # NaN too
             reasons.append(f"the promise is above {in_nanometres(error_max)} (calibrated_error_max)")
         return reasons
 
@@ -238,6 +240,8 @@ def _check_result(calibration: Calibration) -> None:
             raise CalibrationFileError(f"result/{name} has the shape {np.shape(value)}: must be {shape}")
         if name != "map_residual" and not np.isfinite(value).all():
             raise CalibrationFileError(f"result/{name} holds values that are not finite")
+    if not np.isin(fit.grades, range(len(GRADE_NAMES))).all():
+        raise CalibrationFileError(f"result/grades: must be 0 to {len(GRADE_NAMES) - 1}")
     if len(fit.reasons) != m:
         raise CalibrationFileError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
     if calibration.actuator_x.shape != (n,) or calibration.actuator_y.shape != (n,):

@@ -251,7 +251,8 @@ class CalibrateAction:
             raise Cancelled("cancelled")
         self._report("store", calibration.id, len(self._plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
-        result.file = str(self._manager.keep(calibration))
+        file, calibration = self._manager.keep(calibration)
+        result.file = str(file)
         run.journal.remove()
         result.id = calibration.id
         warning = self._manager.use(calibration) if goal.activate else ""

@@ -96,7 +96,9 @@ class CalibrationManager:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
 
     def use(self, calibration: Calibration | None) -> str:
-        """Use `calibration`, which is in the store, from now on. Raises Refusal if the node is inactive by now.
+        """Use `calibration`, which is in the store, from now on.
+
+        Raises Refusal if the node is inactive by now, or the mirror is another one by now.
 
         Returns a warning if it promises clearly less than its predecessor, or if the choice could not be stored for the
         next start; "" = neither.
@@ -105,6 +107,8 @@ class CalibrationManager:
             before = self.in_use
             if calibration is not None and (reason := self._resting()):
                 raise Refusal(ErrorCode.NODE_INACTIVE, f"{calibration.id} is stored, but not used: {reason}")
+            if calibration is not None and (wrong := self.mismatch(calibration)):
+                raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"{calibration.id} is stored, but not used: {wrong}")
             self._put(calibration)
         warnings = []
         if calibration is not None:
@@ -209,8 +213,8 @@ class CalibrationManager:
                 self._put(after)
             return after
 
-    def keep(self, calibration: Calibration) -> Path:
-        """Store `calibration` and read it back; a complete one that exists already is left as it is. Returns its file.
+    def keep(self, calibration: Calibration) -> tuple[Path, Calibration]:
+        """Store `calibration`, unless a complete one exists already; returns the file and what is in it.
 
         Raises:
             StoreError: it cannot be written, or the maps read back differ from those measured.
@@ -220,9 +224,10 @@ class CalibrationManager:
             file = self.store.find(calibration.id)
         except UnknownNameError:
             file = self.store.save(calibration)
-        if raw_hash(self.store.load(calibration.id)) != raw_hash(calibration):
+        stored = self.store.load(calibration.id)
+        if raw_hash(stored) != raw_hash(calibration):
             raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")
-        return file
+        return file, stored
 
     def provenance(self, name: str, serial: str, note: str) -> Provenance:
         """A new id and the current time for a calibration of mirror `name`, `serial`."""

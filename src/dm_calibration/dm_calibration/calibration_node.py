@@ -154,6 +154,8 @@ class CalibrationNode(ManagedNode):
         self._recorder.recall(mirror.serial, 1e-9 * self.get_clock().now().nanoseconds)
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
+        if before is not None and before.serial != mirror.serial and self._manager.in_use is None:
+            self._start_pending = bool(self._values["load_on_start"])  # another mirror: the one that it used last
         if before is not None and before.limits.middle != mirror.limits.middle:
             self._manager.publish_again()  # a degauss ends at mid range, from where hysteresis is followed
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"

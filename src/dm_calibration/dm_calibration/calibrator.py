@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.map_sources import Maps, outcome_of, unix_times
-from dm_calibration.calibration import Calibration, software_version
+from dm_calibration.calibration import POKE_CHECK, Calibration, software_version
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet, StepKind
@@ -145,7 +145,7 @@ def calibrate(
         limitations.append("Times of the maps are whole seconds: creep of the first seconds is not well known.")
     if (parts := np.unique(measured.segment).size) > 1:
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
-    limitations += [f"Poke check: {finding}." for finding in check.findings]
+    limitations += _poke_sentences(check)
     limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
     return Calibration(
         id=provenance.id,
@@ -167,6 +167,11 @@ def calibrate(
         **{name: getattr(outcome.setup, name) for name in _INSTRUMENT if outcome.setup},
         region_weights=_region_weights(measured, fit, options),
     )
+
+
+def _poke_sentences(check: PokeCheck) -> list[str]:
+    """The findings as limitations."""
+    return [f"{POKE_CHECK}{finding}." for finding in check.findings]
 
 
 def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
@@ -207,7 +212,12 @@ def refit(
         stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
     )
     fit = fit_effective(stored.maps, stored.hysteresis, options, mirror, exclude)
-    of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
+    of_the_run = [
+        sentence
+        for sentence in stored.limitations
+        if sentence not in stored.fit.limitations and not sentence.startswith(POKE_CHECK)
+    ]
+    poked = _poke_sentences(check_fit(fit, mirror))  # a map left out may have been the cause of a finding
     without = f" without {', '.join(exclude)}" if exclude else ""
     if exclude and stored.hysteresis is not None:
         without += "; the hysteresis model, and the promise, are those of all its maps"
@@ -217,7 +227,7 @@ def refit(
         created_ns=provenance.created_ns,
         fit=fit,
         region_weights=_region_weights(stored.maps, fit, options),
-        limitations=(*fit.limitations, *of_the_run, f"Fitted again from the raw data of {stored.id}{without}."),
+        limitations=(*fit.limitations, *of_the_run, *poked, f"Fitted again from the raw data of {stored.id}{without}."),
         note=provenance.note or stored.note,
         software_version=software_version(),
     )

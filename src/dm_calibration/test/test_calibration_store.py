@@ -335,3 +335,22 @@ def test_a_file_whose_maps_have_no_rows_is_listed_as_unreadable(tmp_path: Path, 
         (tmp_path / f"{name}.h5").write_bytes(write_image(columns, attributes))
     remarks = {entry.id: entry.remark for entry in store.entries()}
     assert remarks.pop("PDM_1") == "" and all("signals" in remark for remark in remarks.values()), remarks
+
+
+def test_a_bound_that_is_no_number_is_no_calibration_and_grades_are_known(
+    tmp_path: Path, calibration: Calibration
+) -> None:
+    unknown = replace(calibration, fit=replace(calibration.fit, held_out_max_zernike=float("nan")))
+    assert "the promise is above" in " ".join(unknown.doubts())
+    columns, attributes = to_columns(calibration)
+    columns["result/grades"] = np.full_like(columns["result/grades"], 9)
+    (tmp_path / f"{calibration.id}.h5").write_bytes(write_image(columns, attributes))
+    with pytest.raises(CalibrationFileError, match="result/grades: must be 0 to 3"):
+        CalibrationStore(tmp_path).load(calibration.id)
+
+
+def test_a_refit_has_the_poke_check_of_its_own_fit(calibration: Calibration) -> None:
+    found = "Poke check: actuator 1 shows no response above the noise."
+    told = replace(calibration, limitations=(*calibration.limitations, found))
+    again = refit(told, FitOptions(), (), Provenance("again", 2))
+    assert found not in again.limitations and again.limitations[-1].startswith("Fitted again")

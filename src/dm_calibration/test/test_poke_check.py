@@ -306,3 +306,10 @@ def test_wrong_shape_is_refused() -> None:
 
 def test_cycles() -> None:
     assert cycles(np.array([0, 2, 1, 4, 5, 3])) == [(1, 2), (3, 4, 5)]
+
+
+@pytest.mark.parametrize("slip", [0.1, 0.05])
+def test_a_slip_in_the_pitch_does_not_fill_the_memory(slip: float) -> None:
+    """At a twentieth of the pitch 6 GB were taken, at a hundredth 66 GB asked for."""
+    result = check_pokes(response(), PLANT.points, slip * X, slip * Y, RADIUS, silent=NONE, unmoved=NONE)
+    assert not result.passed

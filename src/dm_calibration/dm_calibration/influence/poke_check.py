@@ -112,7 +112,8 @@ def check_pokes(
         stands = register(unit[single], single, points, x, y, radius)
         if stands is None:
             problem = (
-                "all channels move the same one or two places: check the wiring, and that the maps are of this mirror"
+                "all channels move the same one or two places: check the wiring, mirror.pitch or mirror.actuator_x and _y,"
+                " and that the maps are of this mirror"
             )
             return replace(nothing, findings=(*findings, problem))
         registration = stands

@@ -28,8 +28,9 @@ Places = NDArray[np.complex128]
 WIDTHS = (0.5, 0.7, 0.9, 1.15, 1.5)
 #: Bumps are looked for up to this distance from the centre of the aperture, in its radii, ...
 REACH = 1.45
-#: ... on a grid of this spacing, in pitches.
-GRID = 0.25
+#: ... on a grid of this spacing, in pitches, but no finer than this, in radii: the smallest distance between two
+#: configured places may be a slip, and the grid must not fill the memory for it.
+GRID, FINEST = 0.25, 0.02
 #: Angles around the full circle at which the search starts, for each image and scale.
 STARTS = 36
 #: Places in the middle over which the innermost bump may lie: one and its neighbours.
@@ -143,7 +144,8 @@ def register(
 
 def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, float]:
     """Where each response (A, P) looks most like a bump, and the width that fits best in all."""
-    line = np.arange(-REACH, REACH + step * GRID, step * GRID)
+    spacing = max(step * GRID, FINEST)
+    line = np.arange(-REACH, REACH + spacing, spacing)
     grid = (line[:, None] + 1j * line).ravel()
     grid = grid[np.abs(grid) <= REACH]
     tables = [np.abs((unit * points.weight) @ bumps(grid, width * step, points)[0].T) for width in WIDTHS]

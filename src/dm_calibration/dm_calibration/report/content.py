@@ -6,14 +6,12 @@ from pathlib import PurePath
 
 import numpy as np
 
-from dm_calibration.calibration import Calibration
+from dm_calibration.calibration import POKE_CHECK, Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report.document import Section, Table
 from dm_common.figures import with_wavelengths
 
 NM = 1e9
-#: Prefix of the sentences from a poke check.
-POKE_CHECK = "Poke check: "
 #: Number of hexadecimal digits of a file's SHA-256 shown in the table of maps.
 SHA_SHOWN = 12
 

@@ -84,7 +84,7 @@ class SurfaceView:
     def _draw(self) -> None:
         """Compute what is shown."""
         self.predicted_then = self.predicted_zernike = None
-        self.when = ""
+        self.when = self.remark = ""
         if isinstance(self._model, str):
             self.predicted = self.difference = self._model
             return
