@@ -112,8 +112,8 @@ def check_pokes(
         stands = register(unit[single], single, points, x, y, radius)
         if stands is None:
             problem = (
-                "all channels move the same one or two places: check the wiring, mirror.pitch or mirror.actuator_x and _y,"
-                " and that the maps are of this mirror"
+                "all channels move the same one or two places: check the wiring, mirror.pitch (or mirror.actuator_x "
+                "and _y), and that the maps are of this mirror"
             )
             return replace(nothing, findings=(*findings, problem))
         registration = stands
@@ -202,10 +202,12 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
     apart = ~np.eye(len(overlap), dtype=bool)
     determinant = np.where(apart, 1.0 - np.square(overlap), 1.0)
     for actuator, row in enumerate(table):
-        first = (row[:, None] - overlap * row) / determinant  # [j, k]: of the bump at j if one at k is fitted too
-        explained = first * row[:, None] + first.T * row  # by both bumps, as a sum of squares
-        rise = first / height[:, None]
-        both = (rise * rise.T > 0.0) & (abs(rise) >= SECOND_MIN * abs(rise.T)) & (abs(rise.T) >= SECOND_MIN * abs(rise))
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # places far beside the aperture
+            first = (row[:, None] - overlap * row) / determinant  # [j, k]: of the bump at j if one at k is fitted too
+            explained = first * row[:, None] + first.T * row  # by both bumps, as a sum of squares
+            rise = first / height[:, None]
+            alike = abs(rise) >= SECOND_MIN * abs(rise.T)
+            both = (rise * rise.T > 0.0) & alike & alike.T
         explained[~(both & apart)] = 0.0
         best = np.unravel_index(explained.argmax(), explained.shape)
         if explained[best] > 0.0 and 1.0 - explained[best] < DOUBLED * (1.0 - np.square(row).max()):

@@ -124,7 +124,7 @@ def register(
     unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float
 ) -> Registration | None:
     """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
-    all of them lie over one place or two.
+    all of them lie over one place or two, or none where the configured positions could be.
 
     Args:
         unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
@@ -139,7 +139,7 @@ def register(
     if np.unique((np.abs(seen[:, None] - seen) < TOGETHER * step).argmax(axis=1)).size < PLACES_MIN:
         return None
     match = _matched(seen, active, places, step)
-    return _refined(match, unit, points, places, width, radius)
+    return _refined(match, unit, points, places, width, radius) if match.placed.any() else None
 
 
 def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, float]:
