@@ -1,4 +1,4 @@
-"""Ask a calibrated mirror for curvatures and hold them against creep, without ROS. See docs/calibrate.md.
+"""Ask a calibrated mirror for curvatures and hold them against creep, without nodes. See docs/calibrate.md.
 
     ./dm exec python examples/plan_shapes.py CALIBRATION.h5
 

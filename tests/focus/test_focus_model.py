@@ -173,5 +173,5 @@ def test_a_mirror_most_of_which_does_nothing_still_focuses(mirror: LinearMirror,
 @pytest.mark.parametrize("terms", [0, 1, 20])
 def test_another_number_of_terms_is_refused_by_name(mirror: LinearMirror, terms: int) -> None:
     model = perfect_model(mirror, 0.0)
-    with pytest.raises(ValueError, match=f"zernike_offset has {terms} terms, must have 21"):
+    with pytest.raises(ValueError, match=f"influence_zernike has {terms} terms, must have 21"):
         replace(model, influence_zernike=model.influence_zernike[:terms], zernike_offset=model.zernike_offset[:terms])

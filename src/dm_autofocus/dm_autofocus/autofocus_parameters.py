@@ -56,7 +56,8 @@ PARAMETERS: Final = (
     Parameter(
         "search.tolerance",
         real(0.0, 0.0, 1.0, "1/m"),
-        "Finest step of curvature; 0 = the depth of focus of the calibrated aperture (a quarter wave at its edge).",
+        "Finest step of curvature, 1/4000 to 1/2 of the range that is searched; 0 = the depth of focus of the "
+        "calibrated aperture (a quarter wave at its edge).",
     ),
     *parameters_of("search.", SearchConfig),
     Parameter(
@@ -93,7 +94,7 @@ def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
 
 
 #: Fewest and most of the finest steps in a range: time and memory of a search grow with their number.
-STEPS_MIN, STEPS_MAX = 4, 4000
+STEPS_MIN, STEPS_MAX = 2, 4000
 
 
 def tolerance_of(values: Mapping[str, Any], aperture_radius: float) -> float:

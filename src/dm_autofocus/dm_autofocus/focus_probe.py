@@ -227,7 +227,7 @@ class FocusProbe:
         Raises:
             Refusal: no such image came in time, it cannot be used, or the user is to stop.
         """
-        samples, damaged, limit = list[SharpnessSample](), 0, self._values["image_timeout"]
+        samples, damaged, unusable, limit = list[SharpnessSample](), 0, "", self._values["image_timeout"]
         with self._changed:
             self._fresh, self._measuring = None, True
         try:
@@ -240,12 +240,12 @@ class FocusProbe:
                     newest = None if self.newest is None or self.newest is before else seconds(self.newest.header.stamp)
                     reason = self._gate.reason(newest, self._apart, limit, self._now())
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
-                    raise Refusal(ErrorCode.TIMEOUT, text)
+                    raise Refusal(ErrorCode.TIMEOUT, text + unusable)
                 try:
                     samples.append(self.sharpness_of(message, region))
-                    damaged, self.counted = 0, self.counted + 1
-                except Refusal:
-                    damaged, self.dropped = damaged + 1, self.dropped + 1
+                    damaged, unusable, self.counted = 0, "", self.counted + 1
+                except Refusal as error:
+                    damaged, unusable, self.dropped = damaged + 1, f"; the last one: {error}", self.dropped + 1
                     if damaged > DAMAGED_MAX:
                         raise
         finally:

@@ -137,6 +137,12 @@ class CalibrationManager:
             if self.in_use is not None:
                 self._put(self.in_use)
 
+    def publish_none(self) -> None:
+        """Publish that there is no calibration, unless one is in use by now."""
+        with self._lock:
+            if self.in_use is None:
+                self._put(None)
+
     def load(self, name: str) -> tuple[Calibration, str]:
         """Load by id or file (empty = the newest that fits), and use it. Returns it and the warning of `use`.
 

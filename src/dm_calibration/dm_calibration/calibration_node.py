@@ -180,8 +180,7 @@ class CalibrationNode(ManagedNode):
                 self.get_logger().info(f"{error}: calibrate first")
             else:
                 self.get_logger().warning(f"load_on_start = {name!r}: {error}")
-            if self._manager.in_use is None:
-                self._publish(None, None)
+            self._manager.publish_none()
 
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._manager.in_use

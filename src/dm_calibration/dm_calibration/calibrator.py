@@ -141,7 +141,8 @@ def calibrate(
     wavelength = outcome.setup.wavelength if outcome.setup else 0.0
     if wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
-    if found and commands is not None and times is None and not (measured.stamp_ns % 10**9).any():
+    seen = measured.stamp_ns[np.isfinite(measured.coefficients).all(axis=1)]  # times of others may be estimated
+    if found and commands is not None and times is None and not (seen % 10**9).any():
         limitations.append("Times of the maps are whole seconds: creep of the first seconds is not well known.")
     if (parts := np.unique(measured.segment).size) > 1:
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")

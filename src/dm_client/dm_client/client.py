@@ -114,9 +114,10 @@ class DeformableMirrorClient(Connection):
     # --- what is known ---
 
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
-        """The latest message on one of TOPICS. Raises DeformableMirrorError for another, or when none came in time."""
-        if topic not in TOPICS:
-            raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, f"{topic!r}: must be one of {', '.join(TOPICS)}")
+        """The latest message on a topic that it hears. Raises DeformableMirrorError for others, or if none came."""
+        if topic not in self._heard:
+            text = f"{topic!r}: must be one of {', '.join(sorted(self._heard))}, or be heard first (hear)"
+            raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")
         return self.messages[topic]

@@ -230,8 +230,8 @@ class Connection:
     ) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
-        Ctrl-C, `stop` and an error in `on_feedback`, which is raised here, cancel the goal, so that the mirror is left
-        in a safe state; `identity`: see `run_goal`.
+        Ctrl-C, `stop` and any exception in `on_feedback`, which is raised here, cancel the goal, so that the mirror is
+        left in a safe state; `identity`: see `run_goal`.
         """
         failed = list[BaseException]()
 
@@ -261,8 +261,8 @@ class Connection:
         return checked(result)
 
     @contextmanager
-    def _answered(self, name: str, other: type) -> Iterator[Callable[[], str]]:
-        """Raise DeformableMirrorError if `name`, whose client is no `other`, does not answer.
+    def _answered(self, name: str, not_a: type) -> Iterator[Callable[[], str]]:
+        """Raise DeformableMirrorError if `name` does not answer, or has a client of the kind `not_a`.
 
         Yields a function: why its node is gone since now.
         """
@@ -270,7 +270,7 @@ class Connection:
         if self._background.is_here:
             text = f"{name}: no answer comes while a callback waits for it: call it from another thread"
             raise DeformableMirrorError(ErrorCode.BUSY, text)
-        named = [each for each, client in self.clients.items() if not isinstance(client, other)]
+        named = [each for each, client in self.clients.items() if not isinstance(client, not_a)]
         if name not in named:
             text = f"{name!r}: must be one of {', '.join(named)}"
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)

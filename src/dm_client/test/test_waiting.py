@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 from dm_msgs.action import Converge, MoveFocus
-from dm_msgs.msg import ActuatorState, Capabilities
+from dm_msgs.msg import ActuatorState, Capabilities, RecipeBook
 from dm_msgs.srv import SetSignals
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError, connection
 from dm_common.errors import ErrorCode
+from dm_common.ros import qos
 from dm_common.ros.qos import Liveliness
 
 #: A node that is there.
@@ -31,6 +32,7 @@ def client(driver: int, able: int | None) -> DeformableMirrorClient:
     heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
     heard._background = SimpleNamespace(is_here=False)  # type: ignore[assignment]
     heard._context = SimpleNamespace(ok=lambda: True)
+    heard._heard = {"actuator_state", "capabilities"}
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
@@ -101,9 +103,18 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(
 
 
 def test_a_topic_that_it_does_not_hear_is_named() -> None:
-    with pytest.raises(DeformableMirrorError, match="'zernike': must be one of mirror_info, calibration") as refused:
-        client(ActuatorState.STATE_ACTIVE, ErrorCode.OK).latest("zernike")
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    with pytest.raises(DeformableMirrorError, match="'zernike': must be one of actuator_state") as refused:
+        asked.latest("zernike")
     assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
+
+
+def test_a_topic_that_is_heard_has_a_latest_message(domain: int) -> None:
+    with DeformableMirrorClient(domain=domain) as mirror:
+        mirror.hear("recipes", RecipeBook, qos.LATCHED)
+        publisher = mirror.node.create_publisher(RecipeBook, "recipes", qos.LATCHED)
+        publisher.publish(RecipeBook(calibration_id="c1"))
+        assert mirror.latest("recipes", 20.0).calibration_id == "c1"
 
 
 def test_services_and_actions_are_not_taken_for_each_other(domain: int) -> None:

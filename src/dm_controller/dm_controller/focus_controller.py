@@ -146,7 +146,7 @@ class FocusController:
         The newest request wins.
         """
         self.requests += 1
-        order = Order(request, now, starts=self.monitor.starts)
+        order = Order(request, now)
         return order, self._attempt(order, now, dry_run)
 
     def judge(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:
@@ -217,7 +217,7 @@ class FocusController:
     def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
         """Send the command of `move`, the shape to keep from now on; until the driver has it, the one before holds."""
         order.command = SendCommand(move.signals, now, 0, order.request.holder, order.request.take_over)
-        order.checked = now.time
+        order.checked, order.starts = now.time, self.monitor.starts
         effects: list[Effect] = [order.command]
         if (before := self.monitor.order) is not None and before.command is not None:
             if not before.answered:

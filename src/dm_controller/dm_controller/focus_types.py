@@ -77,7 +77,7 @@ class Order:
         checked: s, ROS time, of the last check for creep.
         stood: the order whose shape stays if the driver does not take the first command, until it has; None = none.
         kept: its move was not stopped.
-        starts: number of times that the driver had been activated anew when it was asked for.
+        starts: number of times that the driver had been activated anew when its first command was sent.
     """
 
     request: FocusRequest

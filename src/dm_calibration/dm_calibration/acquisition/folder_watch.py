@@ -7,7 +7,7 @@ agree: times are measured by this machine's monotonic clock.
 
 import fnmatch
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -72,11 +72,15 @@ class FolderWatch:
         Raises:
             OSError: the folder cannot be read now; the known files are kept.
         """
-        listed, disk = self.signatures(), self.folder.stat().st_dev
+        disk, listed = self.folder.stat().st_dev, self.signatures()
+        if self.folder.stat().st_dev != disk:  # it is being mounted
+            return []
         if disk != self._disk:
             if self._known is not None:
                 self._known_on[self._disk] = self._known
             self._disk, self._known = disk, self._known_on.pop(disk, None)
+            if self._known is None:
+                self._known = self._seen_elsewhere(listed)
         if self._known is None:
             self._known = {name: _Candidate(signature, now, done=True) for name, signature in listed.items()}
         known = {name: candidate for name, candidate in self._known.items() if name in listed}
@@ -90,6 +94,13 @@ class FolderWatch:
                 ready.append((signature.modified_ns, self._judge(name, signature)))
         self._known = known
         return [event for _time, event in sorted(ready)]
+
+    def _seen_elsewhere(self, listed: Mapping[str, Signature]) -> dict[str, _Candidate] | None:
+        """The known files of a disk that has come back as another device, by one that is `listed`; None = none has."""
+        for device, known in self._known_on.items():
+            if any(listed.get(name) == candidate.signature for name, candidate in known.items()):
+                return self._known_on.pop(device)
+        return None
 
     def closed(self, names: Iterable[str], now: float) -> list[FileEvent]:
         """Check files that their writer has just closed; those known to be complete are ready without waiting.

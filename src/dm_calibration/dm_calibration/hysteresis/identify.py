@@ -195,7 +195,7 @@ def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
     if slope.min() >= slope_min:
         return ""
     others = int((slope < slope_min).sum()) - 1
-    also = f" (and too far on {others} others)" if others else ""
+    also = f" (and too far on {others} more)" if others else ""
     whose = f"the slope of actuator {slope.argmin() + 1}" if slope.size > 1 else "its slope"
     return f"{whose} falls to {slope.min():.2f}{also}: it could not be inverted safely"
 

@@ -98,7 +98,7 @@ def check_pokes(
     quiet = (silent | (size == 0.0)) & ~unmoved
     active = np.flatnonzero(~(quiet | unmoved))
     nothing = PokeCheck(None, np.arange(count))
-    findings = _named(quiet, "show{} no response above the noise")
+    quiet_said = findings = _named(quiet, "show{} no response above the noise")
     if active.size < max(ANSWERS_MIN, ANSWERS_SHARE * (active.size + quiet.sum())):
         problem = (
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
@@ -134,9 +134,9 @@ def check_pokes(
         )
         return replace(nothing, findings=(*findings, problem))
     pose, turned = _pose_findings(registration, pitch(x, y))
-    if pose and findings:  # an actuator of the rim may stand beside the aperture as long as that is not on the mirror
-        findings[0] += " in the maps as they are now: check again once they are corrected"
-    findings += pose + _sign_findings(np.sign(found), active) + _place_findings(place)
+    if pose:  # an actuator of the rim may stand beside the aperture as long as that is not on the mirror
+        quiet_said = [f"{text} in the maps as they are now: check again once they are corrected" for text in quiet_said]
+    findings = quiet_said + pose + _sign_findings(np.sign(found), active) + _place_findings(place)
     for actuator, pair in double.items():
         findings.append(f"actuator {actuator + 1} moves the places of {pair[0] + 1} and {pair[1] + 1} together")
     alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))

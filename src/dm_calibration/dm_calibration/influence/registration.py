@@ -124,7 +124,7 @@ def register(
     unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float
 ) -> Registration | None:
     """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
-    all of them lie over one place or two, or none where the configured positions could be.
+    all of them lie over one place or two.
 
     Args:
         unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
@@ -139,7 +139,7 @@ def register(
     if np.unique((np.abs(seen[:, None] - seen) < TOGETHER * step).argmax(axis=1)).size < PLACES_MIN:
         return None
     match = _matched(seen, active, places, step)
-    return _refined(match, unit, points, places, width, radius) if match.placed.any() else None
+    return _refined(match, unit, points, places, width, radius)
 
 
 def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, float]:
@@ -215,6 +215,8 @@ def _refined(
     inside = match.placed & (np.abs(_seen(match.similarity, places)[match.place]) < 1.0)
     inner = inside & (away <= INNER * np.abs(places - places.mean()).max())
     use = next((some for some in (inner, inside) if some.sum() >= INNER_MIN), match.placed).copy()
+    if not use.any():  # no response lies where a configured position could be
+        use[:] = True
     mirrored, root = match.similarity.mirrored, np.sqrt(points.weight)
 
     def residual(values: Floats, chosen: Bools) -> Floats:

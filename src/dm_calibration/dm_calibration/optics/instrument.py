@@ -149,7 +149,8 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     with np.errstate(invalid="ignore"):
         bounds = 2.0 * np.sqrt((along @ covariance[:2, :2] @ along / size**2, covariance[4, 4]))
     if not bounds.max() < UNCERTAIN_MAX:  # NaN too
-        raise ValueError("the marks do not tell scale from distortion: must lie at different distances from the middle")
+        text = "the marks do not tell scale from distortion: must be exact, and not all as far from the middle"
+        raise ValueError(text)
     return LateralScale(size / half, float(values[4]), float(bounds[0]), float(bounds[1]), left)
 
 

@@ -11,6 +11,7 @@ from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS, ex
 from dm_calibration.influence import surfaces
 from dm_calibration.influence.maps import StepKind
 from dm_common import Floats
+from dm_common.limits import SLACK
 from dm_common.mirror import Mirror
 from dm_common.values import live_parameter, real, whole
 
@@ -209,11 +210,11 @@ def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
             signals[k] += sign * amplitude * half_range
             # Scaling about the mean would move every actuator; a smaller poke keeps the others at rest.
             _, factor = mirror.limits.scaled(signals)
-            if factor < 1.0 - 1e-9:  # and slightly less, since the driver checks the limit exactly
+            if factor < 1.0 - SLACK:  # and slightly less, to be inside after rounding
                 signals[k] = mirror.rest[k] + factor * (1.0 - 1e-12) * (signals[k] - mirror.rest[k])
             smallest = min(smallest, factor)
             steps.append(Step(f"poke{mark}{k + 1:02d}", StepKind.POKE, signals))
-    if smallest < 1.0 - 1e-9:
+    if smallest < 1.0 - SLACK:
         remarks.append(f"pokes reduced to {smallest:.0%} of +-{amplitude:g} to keep the mirror's limits")
     return steps
 

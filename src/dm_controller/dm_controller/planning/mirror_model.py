@@ -61,7 +61,7 @@ class InfluenceModel:
         terms, actuators = self.influence_zernike.shape
         points = len(self.sample_x)
         if terms != len(TERMS):
-            raise ValueError(f"calibration: zernike_offset has {terms} terms, must have {len(TERMS)}")
+            raise ValueError(f"calibration: influence_zernike has {terms} terms, must have {len(TERMS)}")
         expected = {
             "zernike_offset": (terms,),
             "sample_y": (points,),

@@ -74,8 +74,12 @@ class Recorder:
         self._stopping = False
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._bag = BagWriter(folder)  # once ROS has started: else it would leave a folder
+        except BaseException:
+            self._context.try_shutdown()
+            raise
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
-        self._bag = BagWriter(folder)  # once ROS has started: else it would leave a folder
         self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
         self._writer.start()
         self._subscribed: set[str] = set()

@@ -34,7 +34,7 @@ def curvatures_of(text: str) -> list[float]:
         first, last, number = float(parts[0]), float(parts[1]), int(parts[2])
     except (ValueError, IndexError) as error:
         raise typer.BadParameter(
-            f"curvatures = {text!r}: must be like -0.02,0,0.02, within 1 1/m, or like {DEFAULT}"
+            f"curvatures = {text!r}: must be like -0.02,0,0.02, below 1 1/m, or like {DEFAULT}"
         ) from error
     if len(parts) != 3 or not (2 <= number <= 1000 and math.isfinite(first) and math.isfinite(last)):
         raise typer.BadParameter(f"curvatures = {text!r}: first:last:number, with 2 to 1000 of them")
