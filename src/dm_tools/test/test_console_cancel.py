@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -91,13 +92,14 @@ def test_a_goal_that_is_not_sent_yet_never_begins(
 ) -> None:
     side, node = bench
     served = BackgroundExecutor(node)
-    found = iter([False])
-    monkeypatch.setattr(side._connection.clients["calibrate"], "server_is_ready", lambda: next(found, True))
+    found = threading.Event()
+    monkeypatch.setattr(side._connection.clients["calibrate"], "server_is_ready", found.is_set)
 
     async def scene() -> None:
         run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
         await asyncio.sleep(0.0)  # it looks for the node
         await side.cancel("calibrate")
+        found.set()
         with pytest.raises(Refusal, match="cancelled before it began"):
             await run
 

@@ -185,9 +185,10 @@ class CalibratedMirror:
             tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
             self.tilt = tilt if np.abs(tilt).max() > LEAST_TILT * response.max() else None
         self.matrix = self.rows(Shape(model.influence_zernike, model.influence_sag), self.tilt)
-        moving = response[response > 0.0]
+        if not (moving := response[response > 0.0]).size:
+            raise ValueError("calibration: no actuator moves the surface")
         share = RIDGE_SHARE if len(moving) == len(response) else RIDGE_SHARE_STUCK
-        self.ridge = (share * float(np.median(moving) if len(moving) else 1.0)) ** 2
+        self.ridge = (share * float(np.median(moving))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
