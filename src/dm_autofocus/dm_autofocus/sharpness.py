@@ -126,10 +126,11 @@ def _finite(image: NDArray) -> NDArray[np.float32]:
     if image.dtype.kind != "f":
         return values
     np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    mean, size = (float(each.mean(dtype=np.float64)) for each in (values, np.abs(values)))
+    sizes = np.abs(values)
+    mean, size = (float(each.mean(dtype=np.float64)) for each in (values, sizes))
     if mean < CANCELLED * size:
         raise ValueError(f"grey levels below 0 cancel the others: their mean is {mean / size:.0%} of their mean size")
-    return np.ldexp(values, -np.frexp(np.abs(values).max())[1])
+    return np.ldexp(values, -np.frexp(sizes.max())[1])
 
 
 def _sobel(above: NDArray, here: NDArray, below: NDArray) -> tuple[NDArray, NDArray]:

@@ -178,13 +178,12 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     last = next((one for one in found if one is not None), None)
     if last is None:
         raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
-    told = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns}
+    told = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns} or {0: 0}
+    # Files without data tell no time: it lies between those of the maps around it; 0 = there are none on either side.
+    between_told = np.interp(range(len(found)), [*told], [*told.values()], left=0, right=0)
     measured = []
-    for number, one in enumerate(found):
-        # Files without data tell no time: it lies between those of the maps around it.
-        inside = bool(told) and min(told) < number < max(told)
-        at = round(np.interp(number, [*told], [*told.values()])) if inside else 0
-        last = without_map(last, stamp_ns=at).record if one is None else one
+    for one, at in zip(found, between_told, strict=True):
+        last = without_map(last, stamp_ns=round(at)).record if one is None else one
         measured.append(last)
     return measured, dropped
 

@@ -134,8 +134,8 @@ class Outcome:
     _given_up: dict[int, int] = field(default_factory=dict)
     # Each drop, and the number of records before it.
     _drops: list[tuple[int, Dropped]] = field(default_factory=list)
-    # Events since the last map: drops, and commands without a map.
-    _failing: list[Dropped] = field(default_factory=list)
+    # Number of events since the last map: drops, and commands without a map.
+    _failing: int = 0
     _unseen: int = 0
 
     def take(self, event: Event) -> None:
@@ -148,13 +148,13 @@ class Outcome:
             case MapTaken():
                 self._add(event.record, event.centre)
                 self.radius_known &= event.radius_known
-                self._failing, self._unseen = [], 0
+                self._failing = self._unseen = 0
             case Unseen():
                 self._add(event.record, NOWHERE)
                 self._unseen += 1
             case Dropped():
                 self.dropped.append(event.reason)
-                self._failing.append(event)
+                self._failing += 1
                 self._drops.append((len(self.records), event))
                 self._given_up[event.step] = self._given_up.get(event.step, 0) + (1_000_000 if event.whole else 1)
             case Solved():
@@ -193,13 +193,12 @@ class Outcome:
     def _begin(self, number: int) -> None:
         """Begin a segment. The last failures are forgotten and tried again: they may be why the run ended."""
         if number and self._failing:
-            del self.dropped[-len(self._failing) :]
-            for drop in self._failing:
+            for _before, drop in self._drops[-self._failing :]:
                 self._given_up.pop(drop.step, None)
-            del self._drops[-len(self._failing) :]
+            del self.dropped[-self._failing :], self._drops[-self._failing :]
         if number and self._unseen:
             del self.records[-self._unseen :], self.centres[-self._unseen :]
-        self.segment, self._failing, self._unseen = number, [], 0
+        self.segment, self._failing, self._unseen = number, 0, 0
 
     def _doubt(self, event: Doubted) -> None:
         doubtful = self.records[event.kept :]
@@ -214,4 +213,4 @@ class Outcome:
             self._given_up.pop(step, None)
         self._drops = [each for each in self._drops if each[0] < event.kept or each[1].whole]
         del self.records[event.kept :], self.centres[event.kept :]
-        self._failing, self._unseen = [], 0
+        self._failing = self._unseen = 0

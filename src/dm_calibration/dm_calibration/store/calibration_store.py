@@ -11,7 +11,7 @@ from dm_calibration.calibration import Calibration, CalibrationFileError, from_c
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError, storing, write_whole
 from dm_common.errors import UnknownNameError
-from dm_common.state_files import state_file
+from dm_common.state_files import file_stem
 
 SUFFIX = ".h5"
 #: Prefixes of the raw data (maps, sampling points, mirror), which never change once a calibration is stored.
@@ -109,9 +109,7 @@ class CalibrationStore:
         return noted if _ID.fullmatch(noted) else ""
 
     def _in_use(self, serial: str) -> Path:
-        file = state_file(str(self.folder), ".txt", "in_use", serial)
-        assert file is not None
-        return file
+        return self.folder / f"{file_stem('in_use', serial)}.txt"
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.
