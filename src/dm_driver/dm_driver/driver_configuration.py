@@ -11,6 +11,7 @@ import numpy as np
 from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.mirror import Mirror
 from dm_common.values import from_values
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import BACK_ENDS
@@ -26,16 +27,15 @@ class DriverConfiguration:
     """A checked configuration.
 
     Attributes:
-        x, y: (N,) actuator positions, m.
-        limiter: with the limits and neighbour pairs.
+        mirror: geometry and limits.
+        limiter: holds writes to these limits.
         output: wiring and volts.
         safe_shape: (N,) legal signals.
         settings: how the electronics are reached.
         electronics: the back end, not yet opened.
     """
 
-    x: Floats
-    y: Floats
+    mirror: Mirror
     limiter: SafetyLimiter
     output: OutputStage
     safe_shape: Shape
@@ -114,8 +114,14 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     doubt = math.floor(limits.step / scale.resolution) if values["electronics.await_arrival"] else 0
     settings = replace(settings, doubt=doubt)
     return DriverConfiguration(
-        x=x,
-        y=y,
+        mirror=Mirror(
+            values["mirror.name"],
+            values["mirror.serial"],
+            x,
+            y,
+            0.5 * values["mirror.working_aperture_diameter"],
+            limits,
+        ),
         limiter=limiter,
         output=OutputStage(scale, channel_of_actuator, back_end.channels),
         safe_shape=safe_shape,

@@ -9,17 +9,12 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState, MirrorInfo
-from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.messages import doubles, time_message
+from dm_common.messages import doubles, mirror_info_of, time_message
 from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Kind, WriterState
-
-
-def _indices(values: NDArray[np.intp]) -> array.array[int]:
-    return array.array("I", values.astype(np.uint32).tobytes())
 
 
 def driver_state(state: WriterState) -> int:
@@ -85,22 +80,12 @@ def mirror_info_message(
     values: Mapping[str, Any], configuration: DriverConfiguration, frame_id: str, now: Any
 ) -> MirrorInfo:
     """Geometry and limits, for calibration and control. `now` is a time message."""
-    limits, scale = configuration.limiter.limits, configuration.output.scale
+    scale = configuration.output.scale
     knows_volts = configuration.electronics.knows_volts
-    message = MirrorInfo(
-        name=values["mirror.name"],
-        serial=values["mirror.serial"],
-        actuators=limits.actuators,
-        actuator_x=doubles(configuration.x),
-        actuator_y=doubles(configuration.y),
-        neighbour_a=_indices(limits.pairs[:, 0]),
-        neighbour_b=_indices(limits.pairs[:, 1]),
+    message = mirror_info_of(
+        configuration.mirror,
         full_aperture_diameter=values["mirror.full_aperture_diameter"],
-        working_aperture_diameter=values["mirror.working_aperture_diameter"],
-        signal_min=limits.low,
-        signal_max=limits.high,
-        neighbour_difference_max=limits.neighbour_difference,
-        slew_rate_max=limits.slew_rate,
+        slew_rate_max=configuration.limiter.limits.slew_rate,
         volts_min=scale.volts_min if knows_volts else math.nan,
         volts_max=scale.volts_max if knows_volts else math.nan,
         safe_signals=doubles(configuration.safe_shape),
