@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusRequest, FocusState, MirrorInfo
 
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
@@ -137,6 +137,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment, 
         figures |= {
             "curvature": order.move.target.curvature,
             "age": f"{now.time - order.began.time:.1f}",
+            "conditioned": order.move.mode == FocusRequest.MODE_CONDITIONED,
             "predicted": predicted,
             "bound": bound,
         }

@@ -788,6 +788,9 @@ def test_a_recipe_follows_its_degauss(bench: Bench) -> None:
     assert bench.outcomes[-1].applied
     bench.time += 0.05
     assert bench.error(effective) < 1e-6
+    assert health(bench.controller, VALUES, bench.now).values["conditioned"] is True
+    bench.ask(0.01)
+    assert health(bench.controller, VALUES, bench.now).values["conditioned"] is False
 
 
 # --- the driver ---

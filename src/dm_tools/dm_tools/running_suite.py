@@ -184,6 +184,7 @@ class SettledShape(NamedTuple):
         bound: m, 95 % bound on its largest coefficient error.
         held: creep is fed forward.
         predicted: m, the part of that error that was predicted: it is due to the limits, and maps should show it.
+        conditioned: it was taken from the degaussed mirror, by a recipe where there is one.
     """
 
     curvature: float
@@ -191,6 +192,7 @@ class SettledShape(NamedTuple):
     bound: float
     held: bool
     predicted: float
+    conditioned: bool
 
 
 def settled_shape(health: dict[str, Any]) -> SettledShape | None:
@@ -200,4 +202,5 @@ def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     if "curvature" not in values:
         return None
     curvature, age, bound, predicted = (float(values[name]) for name in ("curvature", "age", "bound", "predicted"))
-    return SettledShape(curvature, age, bound, values["held"] == "True", predicted)
+    held, conditioned = (values[name] == "True" for name in ("held", "conditioned"))
+    return SettledShape(curvature, age, bound, held, predicted, conditioned)

@@ -246,7 +246,7 @@ def test_messages_have_their_time_and_the_log_keeps_them(monkeypatch: pytest.Mon
 
 
 def test_the_page_says_where_the_mirror_stands() -> None:
-    values = {"curvature": 0.05, "age": "40.0", "predicted": 0.0, "bound": 1.3e-9, "held": False}
+    values = {"curvature": 0.05, "age": "40.0", "predicted": 0.0, "bound": 1.3e-9, "held": False, "conditioned": False}
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     heard = {"pdm_driver": DiagnosticStatus(), "focus_controller": DiagnosticStatus(values=pairs)}
     snapshot = Snapshot(actuator_state=ActuatorState(), health=heard)

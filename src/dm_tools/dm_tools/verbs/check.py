@@ -49,7 +49,7 @@ def check(
         health = hear_health(client)
         # The bound of the present shape as it was promised before the map, which may widen it, and not the one that the
         # calibration promises for any shape. Its predicted part is subtracted, because the map is compared with the
-        # prediction.
+        # prediction. A recipe is right where the model is not, so that of a conditioned shape is the model's bound.
         patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
         client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
@@ -59,8 +59,10 @@ def check(
     lost = unknown_history(capabilities)
     if lost or capabilities is None:  # the promise of a focus controller that knew as much as that node
         promised = promise_of(calibration)
+    elif shape is None or shape.conditioned:
+        promised = capabilities.error_bound
     else:
-        promised = shape.bound - shape.predicted if shape is not None else capabilities.error_bound
+        promised = shape.bound - shape.predicted
     if forget:
         console.print(response.message)
     else:
