@@ -411,15 +411,23 @@ def test_what_is_for_publishing_is_refused_where_nothing_is_published(tmp_path: 
         CliRunner().invoke(make_app(), [*command, "--namespace", "middle"], catch_exceptions=False)
 
 
-def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain: int, tmp_path: Path) -> None:
+def test_what_is_published_is_recorded_latched_or_not(
+    observer: Observer, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     latched = observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
     stream = observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
     latched.publish(MirrorInfo(serial="before the recording"))
     with Recorder(tmp_path / "bag", domain=domain) as recorder:
         wait_until(lambda: stream.get_subscription_count() and recorder.counts.get("/mirror_info"), 60)
-        for number in range(50):
+        for number in range(25):
+            stream.publish(ActuatorState(sequence=number))
+        wait_until(lambda: recorder.counts.get("/actuator_state") == 25, 60)
+        now = time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda: now() - 5 * 10**9)  # the clock is set back
+        for number in range(25, 50):
             stream.publish(ActuatorState(sequence=number))
         wait_until(lambda: recorder.counts["/actuator_state"] == 50, 60, "all states in the recording")
+    monkeypatch.undo()
     bag = BagReader(tmp_path / "bag")
     states = list(bag.read(["/actuator_state"]))
     cls = message_class("dm_msgs/msg/ActuatorState")

@@ -90,7 +90,7 @@ class VirtualBench:
             self.plate = Plate(config.plate)
             self.actuators = PiezoActuators(config.piezo, gains, signals, now())
         else:
-            self.plate = self.actuators = Membrane(config.membrane, gains, now())
+            self.plate = self.actuators = Membrane(config.membrane, gains, now(), config.drive.volts_max)
         if len(config.drive.wiring) != len(self.plate.x):
             raise ValueError(f"wiring: {len(config.drive.wiring)} channels given, {len(self.plate.x)} are needed")
         self._move()
@@ -176,7 +176,7 @@ class VirtualBench:
                 path = self._next_path()
             deliver(self._map_file(sag, path.suffix, int(now)), path, files.slow_write)
             if files.limit and path.parent == files.folder.absolute():
-                prune(path.parent, files.limit)
+                prune(path.parent, files.limit, path)
             self.maps_written += 1
         return path
 

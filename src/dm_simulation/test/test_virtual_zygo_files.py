@@ -103,6 +103,16 @@ def test_a_file_appears_whole(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["map.dat"]
 
 
+def test_a_slow_file_that_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_seconds: float) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(time, "sleep", full)
+    with pytest.raises(OSError, match="No space"):
+        deliver(bytes(80_000), tmp_path / "map.dat", 0.4)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_slow_file_grows_in_pieces(tmp_path: Path) -> None:
     content = bytes(80_000)
     target = tmp_path / "map.dat"
@@ -133,3 +143,8 @@ def test_the_oldest_maps_go_and_nothing_else(tmp_path: Path) -> None:
     assert [path for path in (*others, *maps) if path.exists()] == [*others, *maps[2:]]
     prune(tmp_path, 1)
     assert [path for path in maps if path.exists()] == maps[3:], "the newest stays"
+    late = tmp_path / "map_000002.datx"  # written after the clock was set back
+    late.write_bytes(bytes(100))
+    os.utime(late, (1, 1))
+    prune(tmp_path, 1, late)
+    assert late.exists() and maps[3].exists()

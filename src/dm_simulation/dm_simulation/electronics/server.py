@@ -78,7 +78,11 @@ class ElectronicsServer:
         self._stream = bytearray()
         self._loop = EventLoop("electronics", lambda error: on_event(True, f"failed, {type(error).__name__}: {error}"))
         self.run = self._loop.run
-        self._terminal = SerialTerminal(unit, ports.framed, self._loop, on_update, self._reject)
+        try:
+            self._terminal = SerialTerminal(unit, ports.framed, self._loop, on_update, self._reject)
+        except ValueError:
+            self._loop.close()
+            raise
         try:
             self.run(self._plug)
         except BaseException:

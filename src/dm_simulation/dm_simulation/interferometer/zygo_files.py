@@ -146,12 +146,16 @@ def deliver(content: bytes, path: Path, seconds: float = 0.0) -> None:
     """
     if seconds > 0:
         step = -(-len(content) // PIECES)
-        with path.open("wb") as file:
-            for start in range(0, len(content), step):
-                if start:
-                    time.sleep(seconds / (PIECES - 1))
-                file.write(content[start : start + step])
-                file.flush()
+        try:
+            with path.open("wb") as file:
+                for start in range(0, len(content), step):
+                    if start:
+                        time.sleep(seconds / (PIECES - 1))
+                    file.write(content[start : start + step])
+                    file.flush()
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -162,8 +166,8 @@ def deliver(content: bytes, path: Path, seconds: float = 0.0) -> None:
         raise
 
 
-def prune(folder: Path, limit: float) -> None:
-    """Remove the oldest maps until those in `folder` take no more than `limit` bytes; the newest is always kept.
+def prune(folder: Path, limit: float, keep: Path | None = None) -> None:
+    """Remove the oldest maps until those in `folder` take no more than `limit` bytes, but not the newest, nor `keep`.
 
     Only files with a name that the bench or the node `interferometer` gives to maps are counted and removed.
     """
@@ -174,6 +178,6 @@ def prune(folder: Path, limit: float) -> None:
     total = 0
     for number, (_time, size, path) in enumerate(sorted(maps, reverse=True)):
         total += size
-        if number and total > limit:
+        if number and total > limit and path != keep:
             with contextlib.suppress(OSError):
                 path.unlink()

@@ -2,7 +2,8 @@
 
 The membrane is under tension T and clamped at its edge, so its deflection follows the Poisson equation
 ``T div grad w = -p`` with w = 0 there ([30]). Electrodes act on it with ``p = epsilon V^2 / (2 g^2)``, g the present
-gap: they only pull, the more strongly the closer the membrane has come, until it rests on stops at a third of the gap.
+gap: they only pull, the more strongly the closer the membrane has come. Where it has come closer by a third of the gap
+it would fall onto them, so mirrors that full volts bring there are refused.
 There is neither hysteresis nor creep; the zero drifts slowly after the start, as in a mount that warms up.
 
 With rho = r / a, the polynomials ``(1 - rho^2) rho^m P_k^(1,m)(2 rho^2 - 1)`` times cos or sin of m theta vanish at the
@@ -24,6 +25,8 @@ from dm_simulation.mirror.zernike import Array
 EPSILON = 8.8541878128e-12
 #: Quadrature points over an electrode, along its radius and around it: accurate to 1e-9 of its load.
 _RADII, _ANGLES = 6, 16
+#: Deflection, as a share of the gap, beyond which the pull grows faster than the tension.
+NEAREST = 1 / 3
 #: Most iterations of gap and pressure, and the change of the deflection, as a share of the gap, that ends them.
 _ROUNDS, _SETTLED = 100, 1e-9
 
@@ -53,16 +56,19 @@ class Membrane:
         config: geometry.
         rng: draws the pull of the electrodes and the pattern of the drift.
         time: s, at which the drift of the zero begins.
+        volts_max: full volts.
 
     Attributes:
         x, y: positions of the electrodes (N,), m.
         radius: m.
 
     Raises:
-        ValueError: the electrodes do not form full rings, or extend beyond the membrane.
+        ValueError: the electrodes do not form full rings, or extend beyond the membrane, or full volts pull it there.
     """
 
-    def __init__(self, config: MembraneConfig, rng: np.random.Generator, time: float = 0.0) -> None:
+    def __init__(
+        self, config: MembraneConfig, rng: np.random.Generator, time: float = 0.0, volts_max: float = 0.0
+    ) -> None:
         self.config = config
         self.radius = config.diameter / 2
         self.x, self.y = actuator_positions(config.pitch, actuators=config.actuators, name="membrane.actuators")
@@ -82,6 +88,11 @@ class Membrane:
         pattern = 1 + 0.5 * rng.standard_normal(count)
         self._drift = config.drift / np.abs(self._at_electrodes @ pattern).max() * pattern
         self._began = self._time = time
+        if self._pulled(np.full(count, volts_max))[1] >= NEAREST:
+            raise ValueError(
+                f"membrane.tension = {config.tension:g} N/m: must be larger, since {volts_max:g} V pull the membrane "
+                f"onto its electrodes (membrane.gap = {config.gap:g} m)"
+            )
         self.apply(np.zeros(count), time)
 
     def _modes(self, x: Array, y: Array) -> Array:
@@ -117,14 +128,19 @@ class Membrane:
     def apply(self, volts: Array, time: float) -> None:
         """Take new volts (N,) at `time`."""
         self.advance(time)
+        self._pressure = self._pulled(volts)[0]
+
+    def _pulled(self, volts: Array) -> tuple[Array, float]:
+        """Pressures (N,), Pa, and the largest deflection at an electrode as a share of the gap, at most NEAREST."""
         gap = self.config.gap
         pull = self._gain * EPSILON / 2 * (volts / gap) ** 2
-        nearer = np.zeros(len(pull))  # deflections as shares of the gap: they grow with each iteration
+        nearer = np.zeros(len(pull))  # grows with each iteration
         for _ in range(_ROUNDS):
-            self._pressure = pull / (1 - nearer) ** 2
-            before, nearer = nearer, np.minimum(self._at_electrodes @ self._pressure / gap, 1 / 3)
+            pressure = pull / (1 - nearer) ** 2
+            before, nearer = nearer, np.minimum(self._at_electrodes @ pressure / gap, NEAREST)
             if np.abs(nearer - before).max() < _SETTLED:
                 break
+        return pressure, float(nearer.max())
 
     @property
     def displacement(self) -> Array:

@@ -163,6 +163,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
     model = modelled_way(observer.law, state, actuator, signals)
     before = (await session.ros.call("measure", Measure.Request(label="loop start"), math.inf)).samples
     values: list[float] = []
+    ours = True
     session.progress.steps = len(signals)
     try:
         for step, signal in enumerate(signals, start=1):
@@ -173,9 +174,13 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
             await _set_signals(session, shape)
             await asyncio.sleep(SETTLE_S)
             after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), math.inf)).samples
+            if not np.array_equal(_mirror_and_signals(session)[1], shape):
+                ours = False
+                raise Refusal(ErrorCode.PREEMPTED, "the mirror was moved by somebody else; it stays where it is")
             values.append(first + effective_change(before, after, calibration, actuator))
     except (Refusal, ValueError):
-        await _set_signals(session, start)
+        if ours:
+            await _set_signals(session, start)
         raise
     loop = modelled_loop(observer.law, actuator, mirror.signal_min, mirror.signal_max)
     session.loops[calibration.id, actuator] = dataclasses.replace(

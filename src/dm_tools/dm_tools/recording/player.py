@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -21,6 +22,8 @@ HOUSEKEEPING = ("/rosout", PARAMETER_EVENTS)
 DEPTH = 10
 #: Time for subscribers to find the publishers before the first message, s.
 DISCOVERY_S = 1.0
+#: Longest wait for acknowledgements of the last messages: a subscriber may be suspended.
+ACKNOWLEDGED = Duration(seconds=2)
 
 
 def replayed(
@@ -96,7 +99,7 @@ def play(
             counts[message.topic.name] += 1
             progress(elapsed)
         for publisher in publishers.values():  # otherwise the last messages would be lost with their publisher
-            publisher.wait_for_all_acked()
+            publisher.wait_for_all_acked(ACKNOWLEDGED)
         return counts
 
 

@@ -72,6 +72,8 @@ class Recorder:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()  # of the writer; None = the end
         self._failure: Exception | None = None
         self._stopping = False
+        # Times are of a clock that is never set: messages keep their order.
+        self._since_ns = time.time_ns() - time.monotonic_ns()
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         try:
@@ -94,6 +96,9 @@ class Recorder:
         self._executor.add_node(self._node)
         self._spinning = threading.Thread(target=self._spin, name="recorder", daemon=True)
         self._spinning.start()
+
+    def _now_ns(self) -> int:
+        return self._since_ns + time.monotonic_ns()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -165,7 +170,7 @@ class Recorder:
             return
 
         def take(data: bytes) -> None:
-            self._jobs.put(partial(self._bag.write, name, data, time.time_ns()))
+            self._jobs.put(partial(self._bag.write, name, data, self._now_ns()))
 
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
@@ -179,7 +184,7 @@ class Recorder:
             path = f"{publisher.node_namespace.rstrip('/')}/{name}"
             if name not in NAMES or now < self._asked.get(node, now) or not path.startswith(self._namespace):
                 continue
-            self._seen.setdefault(node, time.time_ns())
+            self._seen.setdefault(node, self._now_ns())
             if path not in self._clients:
                 self._clients[path] = AsyncParameterClient(self._node, path)
             if not self._clients[path].services_are_ready():
