@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dm_calibration.calibrator import fit_effective
 from dm_calibration.hysteresis import hysteresis_fit
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.features import play_values
@@ -17,6 +18,7 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteres
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, run_of
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.screening import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.errors import MeasurementError
@@ -24,6 +26,7 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
 from dm_common.mirror import Applied
+from dm_common.optics.zernike import basis
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow
@@ -96,7 +99,7 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     def one_more(run: Run, *_: object, **__: object) -> Any:
         fitted_to.append(run)
         residual = np.where(np.arange(60) == len(fitted_to), 100.0, 1.0)[:, None]
-        return SimpleNamespace(fit=SimpleNamespace(residual=residual))
+        return SimpleNamespace(closest=residual)
 
     monkeypatch.setattr(hysteresis_fit, "identify", one_more)
     every = Responses(np.zeros((60, 1)), 1, np.ones(60, dtype=bool))
@@ -104,6 +107,19 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     _, kept = hysteresis_fit._without_outliers(run, np.zeros(60, dtype=bool), ())
     assert kept is fitted_to[-1]
     assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
+
+
+def test_a_map_that_contradicts_effective_signals_is_not_in_their_influence_function() -> None:
+    """By less than hysteresis would explain, had the law not accounted for it."""
+    maps, mirror = run(), SimulatedBench(SimulationConfig(seed=23, pixels=120)).mirror
+    wrong = maps.label.index("excitation 50")
+    surface = np.zeros(maps.terms)
+    surface[4] = 1e-7
+    coefficients, sag = maps.coefficients.copy(), maps.sag.copy()
+    coefficients[wrong] += surface
+    sag[wrong] += basis(maps.points.x, maps.points.y)[:, : maps.terms] @ surface
+    fit = fit_effective(replace(maps, coefficients=coefficients, sag=sag), fitted(), FitOptions(), mirror)
+    assert fit.reasons[wrong].startswith("outlier") and fit.used.sum() == len(maps) - 1
 
 
 def test_creep_of_before_is_found_though_each_wrong_map_hides_the_next() -> None:

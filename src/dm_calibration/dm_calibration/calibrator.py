@@ -189,7 +189,8 @@ def fit_effective(
     """The influence function of `maps`, on effective signals if hysteresis is known; raises as `fit_influence`."""
     if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
-    fit = fit_influence(effective_maps(maps, hysteresis.law), options, rings=mirror.rings, exclude=exclude)
+    followed = replace(options, hysteresis_allowance=0.0)  # effective signals do not miss their target
+    fit = fit_influence(effective_maps(maps, hysteresis.law), followed, rings=mirror.rings, exclude=exclude)
     return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 
 

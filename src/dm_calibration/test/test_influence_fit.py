@@ -222,6 +222,17 @@ def test_bad_maps_are_dropped_with_their_reason(mirror: Mirror) -> None:
     assert np.isnan(fit.map_residual[~fit.used]).all()
 
 
+def test_maps_that_lack_a_part_are_left_out_unless_they_are_many(mirror: Mirror) -> None:
+    maps = measure(LinearMirror(mirror.x, mirror.y, noise=1 * NM), mirror)
+    valid = np.full(len(maps), 0.99)
+    valid[[3, 7]] = 0.9, 0.97
+    reasons = reasons_of(fit_influence(replace(maps, valid_fraction=valid)), maps)
+    assert reasons.keys() == {maps.label[3]}
+    assert "a part of the surface is missing: 90.0% of the aperture is valid" in reasons[maps.label[3]]
+    valid[: int(0.3 * len(maps))] = 0.9
+    assert not reasons_of(fit_influence(replace(maps, valid_fraction=valid)), maps)
+
+
 @pytest.mark.parametrize("middle", [-1.0, 0.0, 3.0])
 def test_a_bad_map_is_an_outlier_wherever_mid_range_is(mirror: Mirror, middle: float) -> None:
     """What hysteresis may explain of a map follows from how far the mirror moved, not from the signals' zero.

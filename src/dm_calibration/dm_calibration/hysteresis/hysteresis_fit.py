@@ -9,7 +9,7 @@ from dm_calibration.hysteresis.actuator_weights import weights_of
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.identify import Identification, identify
-from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.responses import Responses, agreeing
 from dm_calibration.hysteresis.run import Run, basis_of, run_of, without
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_common import Bools, Floats
@@ -18,9 +18,8 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
-#: Outliers: a map whose residual exceeds OUTLIER medians contradicts the law (the mirror was touched, or the map is of
-#: another). It is fitted again without them, OUTLIER_ROUNDS fits at most, unless they exceed the share OUTLIERS_MAX.
-OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
+#: Most fits, each without the outliers of the one before.
+OUTLIER_ROUNDS = 4
 #: Effective signals, which go to about 1, from which on creep from before the run is taken for a drift of the figure.
 CREPT_MAX = 1.5
 #: Random draws for the quantile of the largest of several correlated errors.
@@ -89,18 +88,11 @@ def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) ->
     """Identify the law without outliers; in the run returned only the other maps are usable, all commands stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
-        agreeing = _agreeing(run.responses.usable, found.fit.residual)
-        if agreeing.sum() == run.responses.usable.sum():
+        good = agreeing(run.responses.usable, found.closest)
+        if good.sum() == run.responses.usable.sum():
             return found, run
-        run = replace(run, responses=replace(run.responses, usable=agreeing))
+        run = replace(run, responses=replace(run.responses, usable=good))
     return identify(run, test, candidates), run
-
-
-def _agreeing(used: Bools, residual: Floats) -> Bools:
-    """(M,) rows in `used` whose `residual` (M, D) is not an outlier; all rows in `used` if outliers are too many."""
-    size = np.linalg.norm(residual, axis=1)
-    outlier = used & (size > OUTLIER * np.median(size[used]))
-    return used if outlier.sum() > OUTLIERS_MAX * used.sum() else used & ~outlier
 
 
 def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
@@ -165,14 +157,14 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
         effective: (M, N).
         fading: (M, S, N) share of it that is left in each map.
     """
-    agreeing, count, values = responses.usable, responses.coefficients, responses.values
+    good, count, values = responses.usable, responses.coefficients, responses.values
     whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
     for _ in range(OUTLIER_ROUNDS):
-        used = agreeing
+        used = good
         solution = np.linalg.lstsq(whole[used], values[used], rcond=1e-10)[0]
         residual = values - whole @ solution
-        agreeing = _agreeing(used, residual)
-        if agreeing.sum() == used.sum():
+        good = agreeing(used, residual)
+        if good.sum() == used.sum():
             break
     freedom = max(used.sum() - whole.shape[1], 1)
     scatter = np.sqrt(np.square(residual[used]).sum(axis=0) / freedom)

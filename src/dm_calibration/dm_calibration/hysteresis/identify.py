@@ -49,11 +49,14 @@ class Identification:
         scores: held-out error of each candidate relative to the best. A richer candidate that hardly fits its own maps
             better than the best before it has the score of that one.
         refused: reason for each candidate, and for the final fit, that cannot be inverted or creeps without bound.
+        closest: (M, D) residual of the fit that is closest to most maps, chosen or not: outliers are seen by it, since
+            they can hide behind the larger errors of a law that was chosen because of them.
         quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
     fit: LawFit
     held_out: Floats
+    closest: Floats
     scores: dict[str, float]
     refused: dict[str, str]
     quiet: tuple[int, ...] = ()
@@ -115,11 +118,13 @@ def identify(
     common: list[tuple[float, LawFit]] = []  # also non-invertible ones that fade: own laws may begin with them
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
+    residuals: list[Floats] = []
 
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
         name = problem.candidate.name
         whole = whole or problem.fit(train)
+        residuals.append(whole.residual)
         if flat := _too_flat(run, whole, slope_min):
             refused[name] = flat
             if not whole.candidate.own and whole.candidate.slopes:
@@ -168,7 +173,9 @@ def identify(
             held_out = np.where(test[:, None], fitted.residual, np.nan)
         else:
             fitted = whole
-    return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused, quiet)
+    closest = min((*residuals, fitted.residual), key=lambda left: np.median(np.linalg.norm(left[usable], axis=1)))
+    relative = {name: s / score for name, s in scores.items()}
+    return Identification(fitted, held_out, closest, relative, refused, quiet)
 
 
 def _begun(

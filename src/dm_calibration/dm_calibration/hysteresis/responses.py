@@ -11,6 +11,7 @@ import numpy as np
 
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.influence.screening import unusable
 from dm_common import Bools, Floats
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
@@ -20,6 +21,9 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 SCATTER_MIN = 1e-11
 #: Patterns weaker than this share of the strongest are noise.
 WEAKEST_PATTERN = 0.03
+#: Outliers: a map whose residual exceeds OUTLIER medians contradicts the law (the mirror was touched, a door slammed,
+#: or the map is of another). All maps agree if more than the share OUTLIERS_MAX do not.
+OUTLIER, OUTLIERS_MAX = 8.0, 0.1
 #: Least share of points with data for which modes fitted to them fill the gaps; ridge on the amplitudes of these modes,
 #: relative to the information of a map without gaps.
 FILLED_MIN, FILL_RIDGE = 0.9, 1e-3
@@ -91,7 +95,7 @@ class Responses:
     Attributes:
         values: (M, K - 3 + B) m rms: coefficients beyond tilt, as rms sag each, and patterns beyond them.
         coefficients: K - 3.
-        usable: (M,) maps that hold data; rows of the others are 0.
+        usable: (M,) maps that can be fitted; rows of the others are 0.
     """
 
     values: Floats
@@ -111,7 +115,7 @@ def responses_of(maps: MapSet) -> Responses:
     Raises:
         TooFewMapsError: no map can be used.
     """
-    usable: Bools = np.asarray(np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1))
+    usable: Bools = np.array([not reason for reason in unusable(maps, 0.0)])
     if not usable.any():
         raise TooFewMapsError(f"none of the {len(maps)} maps holds data")
     sag = remove_piston_tilt(maps.sag[usable], maps.points)
@@ -126,3 +130,10 @@ def responses_of(maps: MapSet) -> Responses:
     values = np.zeros((len(maps), reduction.size))
     values[usable] = reduction.reduce(maps.coefficients[usable], filled)
     return Responses(values, reduction.coefficients, usable)
+
+
+def agreeing(used: Bools, residual: Floats, outlier_from: float = OUTLIER) -> Bools:
+    """(M,) rows in `used` whose `residual` (M, D) is not an outlier; all rows in `used` if outliers are too many."""
+    size = np.linalg.norm(residual, axis=1)
+    outlier = used & (size > outlier_from * np.median(size[used]))
+    return used if outlier.sum() > OUTLIERS_MAX * used.sum() else used & ~outlier

@@ -14,6 +14,10 @@ MAD_TO_SIGMA = 1.4826
 LEVERAGE_MAX = 0.95
 #: Largest share of sampling points without data.
 MISSING_POINTS_MAX = 0.2
+#: Share of the aperture by which a map may have fewer valid pixels than most: where a part is missing, what the mirror
+#: shows beyond the terms is taken for some of them (10 to 20 nm in random shapes, for a gap of a tenth). If more than
+#: the share GAPS_MAX of the maps have such gaps, they are all taken.
+GAP_MAX, GAPS_MAX = 0.03, 0.25
 #: No map with a smaller residual is an outlier, m rms.
 RESIDUAL_FLOOR = 5e-9
 #: Largest share of the maps that may be dropped as outliers.
@@ -63,8 +67,11 @@ class FitOptions:
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
     """Reason for which each map cannot enter a fit; "" = it can."""
     reasons = []
-    for coefficients, applied, sag, valid in zip(
-        maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, strict=True
+    usual = float(np.median(maps.valid_fraction))
+    gap = maps.valid_fraction < usual - GAP_MAX
+    gap &= gap.mean() <= GAPS_MAX
+    for coefficients, applied, sag, valid, partial in zip(
+        maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, gap, strict=True
     ):
         reason, missing = "", np.isnan(sag).mean()
         if not np.isfinite(coefficients).all():
@@ -75,6 +82,8 @@ def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
             reason = "a sag sample is infinite"
         elif not valid >= valid_fraction_min:
             reason = f"too few valid pixels: {valid:.1%} of the aperture, at least {valid_fraction_min:.0%} are needed"
+        elif partial:
+            reason = f"a part of the surface is missing: {valid:.1%} of the aperture is valid, of most maps {usual:.1%}"
         elif missing > MISSING_POINTS_MAX:
             reason = f"{missing:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
         reasons.append(reason)
