@@ -142,13 +142,6 @@ class Pieces:
         """Signals for the static effective signals `wanted` (N,)."""
         rising = wanted >= state.position
         way, sign = rising.astype(np.intp), np.where(rising, 1.0, -1.0)
-        if len(self.radius) == 1 and self.radius[0] == 0.0:  # no play: one piece, which begins at the present signal
-            start = np.minimum(np.maximum(state.signals + (wanted - state.position), low), high)
-            near, far = np.where(rising, state.signals, low), np.where(rising, high, state.signals)
-            polynomial, none = self.polynomial[:, 0, :, 0], np.zeros(1)
-            return self._newton(
-                state, wanted, sign, polynomial, none, start, np.maximum(near, low), np.minimum(far, high)
-            )
         rows = np.arange(len(wanted))
         laws = rows if self.polynomial.shape[2] > 1 else np.zeros_like(rows)
         onset, at_onset, _, waiting = self.onsets(state, sign[:, None], self.polynomial[:, way, laws])
