@@ -20,6 +20,8 @@ SHIFT_MAX = 0.1
 SCALE_MAX = 0.03
 #: A displaced actuator must fit its new place better than its own by this much in correlation.
 PLACE_MARGIN = 0.08
+#: Correlation with its own place of an actuator that does not answer: it stays there if no other was found there.
+OWN_PLACE = 1e-9
 #: A response that correlates less than this with any bump is not that of one actuator.
 LIKENESS_MIN = 0.4
 #: Least median correlation of the responses with the expected bumps; below it the arrangement is another one.
@@ -173,15 +175,9 @@ def _places(table: Floats, active: Ints, double: dict[int, tuple[int, int]]) -> 
     table = table.copy()
     for actuator, pair in double.items():  # its own place if that is one of the two, else the first
         table[actuator] = np.arange(len(table)) == (actuator if actuator in pair else pair[0])
-    count = table.shape[1]
-    place = np.full(count, -1)
-    place[active] = linear_sum_assignment(-table[active])[1]
-    free = sorted(set(range(count)) - set(place[active].tolist()))
-    for actuator in sorted(set(range(count)) - set(active.tolist())):
-        # A silent actuator keeps its own place when nobody else was found there.
-        place[actuator] = free.pop(free.index(actuator)) if actuator in free else -1
-    for index in np.flatnonzero(place < 0):
-        place[index] = free.pop(0)
+    silent = np.setdiff1d(np.arange(len(table)), active)
+    table[silent, silent] = OWN_PLACE
+    place = np.asarray(linear_sum_assignment(table, maximize=True)[1])
     for cycle in cycles(place):
         members = [actuator for actuator in cycle if actuator in active]
         gain = [table[a, place[a]] - table[a, a] for a in members]
