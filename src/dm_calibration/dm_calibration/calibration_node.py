@@ -70,8 +70,8 @@ class CalibrationNode(ManagedNode):
             self, Calibrate, "calibrate", self._calibrate, exclusive="refuse", fields=requests.CALIBRATE
         )
         self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
-        observer = self._listener.history.observer  # of a record that the focus controller writes, and this only reads
-        self._recorder = CreepRecorder(self._values["state_folder"], observer, self.get_logger().warning)
+        history = self._listener.history  # of a record that the focus controller writes, and this only reads
+        self._recorder = CreepRecorder(self._values["state_folder"], history, self.get_logger().warning)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
         fields = requests.FIT_INFLUENCE_FUNCTION

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 
 import numpy as np
@@ -105,7 +106,7 @@ def test_corrections_of_a_held_shape_are_no_move(history: AppliedHistory, driver
     """Soon after a large move they are large, and come in the middle of an exposure."""
     history.follow(CREEPING)
     held(driver, 0.8, 10.0, 40.0)
-    reports = {seen.report.time: seen.report.signals[0] for seen in history.observer.recent()}
+    reports = {seen.report.time: seen.report.signals[0] for seen in history.recent()}
     times = np.array(list(reports))
     first, last = (reports[times[np.abs(times - stamp).argmin()]] for stamp in (10.5, 11.5))
     assert abs(last - first) > 10 * SMALL_MOVE
@@ -179,7 +180,7 @@ def test_what_another_mirror_held_is_not_held_against_this_one(history: AppliedH
     before.degauss(1.0)
     before.go(10.0, 0.8)
     before.report(36_000.0)
-    history.observer.recall(None, another=True)
+    history.recall(None, another=True)
     for followed in (history, fresh):
         followed.follow(replace(CREEPING, creep_rate=0.021))
         Driver(followed).degauss(40_000.0)
@@ -191,7 +192,14 @@ def test_a_report_counts_as_heard_once_it_is_followed(
     history: AppliedHistory, driver: Driver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who waits for it, in another thread, asks for the state at once."""
-    heard: list[bool] = []
-    monkeypatch.setattr(history.observer, "observe", lambda _report: heard.append(history.heard_since(10.0)))
-    driver.go(10.0, 0.2)
-    assert heard == [False] and history.heard_since(10.0)
+    track, asked = history._track, list[Future[bool]]()
+
+    def tracked(report: Applied) -> None:
+        asked.append(pool.submit(history.heard_since, 10.0))
+        assert not wait(asked, 0.05).done
+        track(report)
+
+    with ThreadPoolExecutor() as pool:
+        monkeypatch.setattr(history, "_track", tracked)
+        driver.go(10.0, 0.2)
+        assert asked[0].result()

@@ -9,7 +9,6 @@ from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import HysteresisObserver, Observed
-from dm_common.mirror import Applied
 
 #: Signals, or effective signals, whose normalised difference is smaller count as the same shape: below 1 nm.
 SMALL_MOVE = 2e-4
@@ -34,37 +33,21 @@ class SettledState:
     since: float
 
 
-class AppliedHistory:
-    """Recent states of the mirror under one hysteresis model; thread-safe, but for `follow`.
-
-    Attributes:
-        observer: of the mirror.
-    """
-
-    def __init__(self) -> None:
-        self.observer = HysteresisObserver()
-        self._heard = float("-inf")
+class AppliedHistory(HysteresisObserver):
+    """Recent states of the mirror under one hysteresis model; thread-safe, but for `follow`."""
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
         """Follow `law` from now on, and apply it to earlier reports as well; None = no hysteresis."""
-        self.observer.use(law or HysteresisModel.linear(), middle)
-
-    def observe(self, report: Applied) -> None:
-        """Take the driver's next report.
-
-        Raises:
-            ValueError: as :meth:`HysteresisObserver.observe`; earlier reports are forgotten.
-        """
-        self.observer.observe(report)
-        self._heard = report.heard  # set last: a thread that waits for it finds the report processed
+        self.use(law or HysteresisModel.linear(), middle)
 
     def heard_since(self, time: float) -> bool:
         """Whether the driver has reported at or after `time` (s), so that every move before it is known."""
-        return self._heard >= time
+        with self._lock:  # a report counts once it is followed
+            return self.latest is not None and self.latest.heard >= time
 
     def still_for(self, time: float) -> float:
         """How long the mirror had kept its present shape at `time`, s; 0 = it moves, infinite = no report yet."""
-        observed = self.observer.recent()
+        observed = self.recent()
         if not observed:
             return float("inf")
         if not self._keeps(observed[-1], observed[-1]):
@@ -80,7 +63,7 @@ class AppliedHistory:
         Raises:
             MapNotUsableError: the mirror moved, or this or the hysteresis of the actuators is not known.
         """
-        law, observed = self.observer.law, self.observer.recent()
+        law, observed = self.law, self.recent()
         times = [seen.report.time for seen in observed]
         at = next((k for k in reversed(range(len(observed))) if times[k] <= time), None)
         if at is None:
@@ -117,7 +100,7 @@ class AppliedHistory:
 
     def _keeps(self, shape: Observed, seen: Observed) -> bool:
         """Whether the mirror had the shape of report `shape` at report `seen`: same signals, or same surface."""
-        law, state, report = self.observer.law, seen.estimate.state, seen.report
+        law, state, report = self.law, seen.estimate.state, seen.report
         ends = [report.signals]
         if report.moving:
             if report.requested is None:
