@@ -98,9 +98,10 @@ def open_run(
     Raises:
         StoreError: the journal cannot be written, or there is not enough space for all maps.
     """
-    notes = [f"unfinished run {text}" for text in runs.others(identity)]
+    resumable, others = runs.find(identity, plan.remarks)
+    notes = [f"unfinished run {text}" for text in others]
     chosen: Kept | None = None
-    for found in runs.find(identity, plan.remarks):
+    for found in resumable:
         reason = "a newer one goes on" if chosen else _reason_against(found, plan, age_max, fresh, now_ns)
         if not reason:
             chosen = found

@@ -76,37 +76,27 @@ class UnfinishedRuns:
         name = next(name for name in names if name not in taken)
         return RunJournal.create(self.folder / name, {"identity": identity, **about})
 
-    def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> list[Kept]:
-        """Runs of the same plan, settings and mirror with at least one map, the newest first."""
-        found = []
-        for folder in self._runs():
-            try:
-                if read_manifest(folder).get("identity") != identity:
-                    continue
-                kept = read_run(folder, remarks)
-            except JournalError:
-                continue
-            if kept.maps:
-                found.append(kept)
-            else:
-                shutil.rmtree(folder, ignore_errors=True)
-        return sorted(found, key=lambda run: (run.last_ns, run.folder.name), reverse=True)
+    def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> tuple[list[Kept], list[str]]:
+        """Runs of the same plan, settings and mirror with at least one map, the newest first.
 
-    def others(self, identity: Mapping[str, Any]) -> list[str]:
-        """A sentence for each unfinished run that a goal with `identity` cannot resume, with the reason."""
-        sentences = []
+        Also a sentence for each other run, with the reason why a goal with `identity` cannot resume it.
+        """
+        found, others = list[Kept](), list[str]()
         for folder in self._runs():
             try:
                 theirs = read_manifest(folder)["identity"]
-                if theirs == identity:
-                    read_run(folder)
+                kept = read_run(folder, remarks) if theirs == identity else None
             except (JournalError, KeyError) as error:
-                sentences.append(f"{folder.name}: {error}")
+                others.append(f"{folder.name}: {error}")
                 continue
-            if theirs != identity:
+            if kept is None:
                 differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
-                sentences.append(f"{folder.name}: other {', '.join(differing)}: it waits for its own goal")
-        return sentences
+                others.append(f"{folder.name}: other {', '.join(differing)}: it waits for its own goal")
+            elif kept.maps:
+                found.append(kept)
+            else:
+                shutil.rmtree(folder, ignore_errors=True)
+        return sorted(found, key=lambda run: (run.last_ns, run.folder.name), reverse=True), others
 
     def set_aside(self, folder: Path) -> Path:
         """Keep the run in `folder`, but never resume it.
@@ -129,8 +119,6 @@ class UnfinishedRuns:
         return [folder.name for folder in removed]
 
     def _runs(self) -> list[Path]:
-        if not self.folder.is_dir():
-            return []
         return [
             path
             for path in self.folder.iterdir()
