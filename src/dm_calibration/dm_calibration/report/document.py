@@ -18,21 +18,12 @@ DPI = 130
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; the first column holds names, the others right-aligned numbers, or texts if `textual`.
-
-    Raises:
-        ValueError: a row of another length than the header.
-    """
+    """Rows under a header; the first column holds names, the others right-aligned numbers, or texts if `textual`."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     textual: bool = False
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.header):
-                raise ValueError(f"{self.caption}: a row of {len(row)} cells under {len(self.header)} headings")
 
 
 @dataclass(frozen=True, eq=False)
