@@ -114,8 +114,7 @@ class Pieces:
                     )
         self.polynomial = self.polynomial.cumsum(axis=-1)
         self.fading = law.fading
-        self._powers = np.arange(1.0, powers)[:, None]
-        self.derivative = self.polynomial[1:] * self._powers[..., None, None]
+        self.derivative = self.polynomial[1:] * np.arange(1.0, powers)[:, None, None, None]
 
     def added(self, state: HysteresisState, there: Floats, sign: Floats) -> tuple[Floats, Floats]:
         """Contribution of Duhem operators to value and slope of the law at `there`, see `FadingHysteresis.along`."""
@@ -139,7 +138,7 @@ class Pieces:
         return onset, horner(polynomial, onset) + waiting + added, rise, waiting
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
-        """Signals for the static effective signals `wanted` (N,)."""
+        """Signals for the static effective signals `wanted` (N,), found by Newton's method."""
         rising = wanted >= state.position
         way, sign = rising.astype(np.intp), np.where(rising, 1.0, -1.0)
         rows = np.arange(len(wanted))
@@ -149,39 +148,21 @@ class Pieces:
         last = len(self.radius) - 1
         piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
         following = np.minimum(piece + 1, last)
-        polynomial, fixed = self.polynomial[:, way, laws, piece], waiting[rows, piece]
         begin, end = onset[rows, piece], np.where(piece < last, onset[rows, following], np.where(rising, high, low))
         # The chord of a narrow piece is a good start; beyond the last onset the slope is about 1.
         before, after = still[rows, piece], still[rows, following]
         chord = np.where(before > after, (end - begin) / np.where(before > after, before - after, 1.0), sign)
-        near, far = np.minimum(begin, end), np.maximum(begin, end)
-        start = np.minimum(np.maximum(begin + chord * before, low), high)
-        return self._newton(state, wanted, sign, polynomial, fixed, start, np.maximum(near, low), np.minimum(far, high))
-
-    def _newton(
-        self,
-        state: HysteresisState,
-        wanted: Floats,
-        sign: Floats,
-        polynomial: Floats,
-        fixed: Floats,
-        signals: Floats,
-        low: Floats,
-        high: Floats,
-    ) -> Inverted:
-        """The root of the increasing law between `low` and `high` (N,), or the end that comes nearest to it."""
-        derivative = polynomial[1:] * self._powers
-        gap = wanted
+        signals = np.minimum(np.maximum(begin + chord * before, low), high)
+        # The root of the increasing law between `near` and `far`, or the end that comes nearest to it.
+        near, far = np.maximum(np.minimum(begin, end), low), np.minimum(np.maximum(begin, end), high)
+        polynomial, derivative = (each[:, way, laws, piece] for each in (self.polynomial, self.derivative))
+        fixed = waiting[rows, piece]
         for _ in range(ROUNDS_MAX):
-            value = horner(polynomial, signals) + fixed
-            slope = horner(derivative, signals)
-            if self.fading is not None:
-                added, rise = self.added(state, signals[:, None], sign[:, None])
-                value, slope = value + added[:, 0], slope + rise[:, 0]
-            gap = value - wanted
-            below = gap < 0.0
-            low, high = np.where(below, signals, low), np.where(below, high, signals)
-            step = np.minimum(np.maximum(signals - gap / np.maximum(slope, SLOPE_MIN), low), high)
+            added, rise = self.added(state, signals[:, None], sign[:, None])
+            gap = horner(polynomial, signals) + fixed + added[:, 0] - wanted
+            slope = horner(derivative, signals) + rise[:, 0]
+            near, far = np.where(gap < 0.0, signals, near), np.where(gap < 0.0, far, signals)
+            step = np.minimum(np.maximum(signals - gap / np.maximum(slope, SLOPE_MIN), near), far)
             if np.abs(step - signals).max() <= TOLERANCE:
                 break
             signals = step
