@@ -13,7 +13,6 @@ from dm_calibration.recalibration.drift import Displaced
 from dm_common import Bools, Floats
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import weighted_fit
-from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, basis
 
 #: Most actuators to which a difference is attributed, and the least share of its sum of squares that each must explain:
@@ -40,27 +39,19 @@ def without_response(calibration: Calibration) -> Bools:
 
 
 def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -> Floats:
-    """`gain` (R, N) per unit of effective signal, with the typical gain for actuators without a response.
+    """`gain` (R, N) per unit of effective signal, with that of a typical piezo mirror for actuators without a response.
 
     For these the fit contains only noise, with which no map could show that they move.
     """
     silent = without_response(calibration)
     if not silent.any() or silent.size < 2:  # no neighbour whose distance gives the width of a bump
         return gain
-    radius = calibration.aperture_radius
-    places = calibration.actuator_x / radius, calibration.actuator_y / radius
-    coefficients, sag = typical_response(*places, calibration.fit.points)
-    return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
-
-
-def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
-    """(N, 21) coefficients and (N, P) sag, m per unit signal, of actuators at x, y (N,), in radii of the aperture.
-
-    Typical of a piezo mirror, from its data sheet; piston and tilt of the sag are removed.
-    """
+    radius, points = calibration.aperture_radius, calibration.fit.points
+    x, y = calibration.actuator_x / radius, calibration.actuator_y / radius
     shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
     sag = TYPICAL_RISE * size[:, None] * shape
-    return weighted_fit(sag, basis(points.x, points.y), points.weight), sag
+    coefficients = weighted_fit(sag, basis(points.x, points.y), points.weight)
+    return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
 
 
 def displaced_actuators(
