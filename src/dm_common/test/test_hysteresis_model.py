@@ -54,7 +54,6 @@ def test_the_hysteresis_matters() -> None:
 def test_what_fades_follows_its_equation() -> None:
     law, signals = replace(fading(), duhem_slope=np.zeros(0)), (0.7, -0.9, 0.2)
     operators = law.fading
-    assert operators is not None
     states, z, u = np.zeros((1, 6)), np.zeros((2, 3)), 0.0
     for signal in signals:
         states = operators.move(states, np.array([u]), np.array([signal]))

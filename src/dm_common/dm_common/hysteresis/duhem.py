@@ -139,7 +139,7 @@ class FadingHysteresis:
     def move(self, states: Floats, signals: Floats, there: Floats) -> Floats:
         """States (N, Z) after straight moves from `signals` (N,), where they are `states`, to `there` (N,)."""
         change = there - signals
-        moved = [] if self._learned is None else [self._learned.move(states[:, 0], change)[:, None]]
+        moved = [states[:, :0] if self._learned is None else self._learned.move(states[:, 0], change)[:, None]]
         if self._rates.size:
             way = np.where(change < 0.0, -1.0, 1.0)[:, None, None]
             powers = np.stack((signals, there))[..., None] ** np.arange(self._drive.shape[2])
@@ -161,7 +161,7 @@ class FadingHysteresis:
             way: 1 for rising, -1 for falling moves; broadcasts to the shape of `there`.
         """
         change = there - signals[:, None]
-        value = slope = np.zeros(())
+        value = slope = np.zeros((1, 1))
         if self._learned is not None:
             z = self._learned.move(states[:, :1], change)
             value, slope = self._learned_weight * z, self._learned_weight * self._learned.rise(z, way)

@@ -38,8 +38,6 @@ ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
 NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
 #: Half the signal step of the finite differences that give the slope of the law.
 SLOPE_STEP = 1e-4
-#: Contribution where there are no Duhem operators.
-NOTHING = np.zeros((1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,7 @@ class Pieces:
         polynomial: (D + 1, 2, 1 or N, R) coefficients by rising power of the sum over the operators 0 .. k that have
             set in, on falling [0] and on rising [1] moves; common to all actuators, or for each.
         derivative: (D, 2, 1 or N, R) likewise, of its slope.
-        fading: contribution of Duhem operators; None = there are none.
+        fading: contribution of Duhem operators, of which there may be none.
     """
 
     def __init__(self, law: HysteresisModel) -> None:
@@ -116,12 +114,6 @@ class Pieces:
         self.fading = law.fading
         self.derivative = self.polynomial[1:] * np.arange(1.0, powers)[:, None, None, None]
 
-    def added(self, state: HysteresisState, there: Floats, sign: Floats) -> tuple[Floats, Floats]:
-        """Contribution of Duhem operators to value and slope of the law at `there`, see `FadingHysteresis.along`."""
-        if self.fading is None:
-            return NOTHING, NOTHING
-        return self.fading.along(state.fading, state.signals, there, sign)
-
     def onsets(self, state: HysteresisState, sign: Floats, polynomial: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Signals (..., N, R) at which operators set in, the law there, the contribution of Duhem operators to its
         slope, and the contribution (N, R) to the law of the operators that have not set in yet.
@@ -134,7 +126,7 @@ class Pieces:
         value = horner(self._single, play)
         waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)
         onset = play + sign * self.radius
-        added, rise = self.added(state, onset, sign)
+        added, rise = self.fading.along(state.fading, state.signals, onset, sign)
         return onset, horner(polynomial, onset) + waiting + added, rise, waiting
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
@@ -158,7 +150,7 @@ class Pieces:
         polynomial, derivative = (each[:, way, laws, piece] for each in (self.polynomial, self.derivative))
         fixed = waiting[rows, piece]
         for _ in range(ROUNDS_MAX):
-            added, rise = self.added(state, signals[:, None], sign[:, None])
+            added, rise = self.fading.along(state.fading, state.signals, signals[:, None], sign[:, None])
             gap = horner(polynomial, signals) + fixed + added[:, 0] - wanted
             slope = horner(derivative, signals) + rise[:, 0]
             near, far = np.where(gap < 0.0, signals, near), np.where(gap < 0.0, far, signals)

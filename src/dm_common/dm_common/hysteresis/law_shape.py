@@ -27,7 +27,7 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Flo
     signals = np.linspace(low, high, PLACES)
     behind = np.stack((high - signals, signals - low))[:, None, :, None]  # on a falling and on a rising move
     slope = horner(parts.derivative[..., None, :], signals[:, None])  # for each number of operators that have set in
-    if parts.fading is not None:
+    if parts.fading.size:
         slope = slope + _fading_slope(parts.fading, law.actuators or 1, signals, parts.radius)
     dead_zone = 0.0 if parts.radius[0] else np.inf  # slope 0 until a first operator sets in, if any does
     return np.asarray(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min(axis=(0, 2, 3)))

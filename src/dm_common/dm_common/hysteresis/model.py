@@ -143,7 +143,7 @@ class HysteresisModel:
     @cached_property
     def has_history(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
-        return bool((self.play_radius > 0.0).any()) or self.fading is not None or self.creep_rate > 0.0
+        return bool((self.play_radius > 0.0).any()) or self.fading.size > 0 or self.creep_rate > 0.0
 
     @cached_property
     def is_identity(self) -> bool:
@@ -156,10 +156,8 @@ class HysteresisModel:
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     @cached_property
-    def fading(self) -> FadingHysteresis | None:
-        """Contribution of Duhem operators; None = there are none."""
-        if not (self.duhem_slope.size or self.fading_rate.size):
-            return None
+    def fading(self) -> FadingHysteresis:
+        """Contribution of Duhem operators, of which there may be none."""
         return FadingHysteresis(self.duhem_slope, self.duhem_weight, self.fading_rate, self.fading_weight)
 
     @cached_property
@@ -199,7 +197,7 @@ class HysteresisModel:
     def demagnetised(self, actuators: int, time: float, middle: float = 0.0) -> HysteresisState:
         """The state after a degauss that ended at `middle`, with creep fully settled there."""
         play = np.full((actuators, len(self.play_radius)), middle)
-        fading = np.zeros((actuators, self.fading.size if self.fading is not None else 0))
+        fading = np.zeros((actuators, self.fading.size))
         position, elements = self._position(play, fading), len(self.creep_time)
         crept = np.repeat(position[:, None], elements, axis=1)
         lagged = np.full((actuators, len(self.lag_time)), middle)
@@ -269,12 +267,11 @@ class HysteresisModel:
         column = signals[:, None]
         # Faster than np.clip for arrays of this size.
         play = np.minimum(np.maximum(state.play, column - self.play_radius), column + self.play_radius)
-        fading = self.fading
-        return play, state.fading if fading is None else fading.move(state.fading, state.signals, signals)
+        return play, self.fading.move(state.fading, state.signals, signals)
 
     def _position(self, play: Floats, fading: Floats) -> Floats:
         total = (horner(np.moveaxis(self.play_weight, -1, 0), play) * play).sum(axis=1)
-        return np.asarray(total if self.fading is None else total + self.fading.value(fading))
+        return np.asarray(total + self.fading.value(fading))
 
     def scaled(self, factor: float | Floats) -> HysteresisModel:
         """The same law with effective signals `factor` times as large, a number or (N,)."""

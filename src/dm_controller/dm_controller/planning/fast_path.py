@@ -129,7 +129,7 @@ class PreparedInverse:
         """Tabulate the pieces, ordered by direction (falling first), then by actuator, then by onset."""
         curve, count = parts.polynomial, len(self.state.signals)
         begin, first, steeper, waiting = parts.onsets(self.state, WAYS, curve)
-        if len(curve) == 2 and parts.fading is None:
+        if len(curve) == 2 and not parts.fading.size:
             slope = 1.0 / np.broadcast_to(curve[1], begin.shape)
             self._table = np.stack((begin, first, slope), axis=-1).reshape(-1, 3)
         else:
@@ -150,7 +150,7 @@ class PreparedInverse:
         end, last = np.empty_like(begin), np.empty_like(begin)
         end[..., :-1], end[..., -1] = begin[..., 1:], ends
         last[..., :-1], last[..., -1] = first[..., 1:], horner(curve[..., -1], ends)
-        added, steeper_last = parts.added(self.state, end, WAYS)
+        added, steeper_last = parts.fading.along(self.state.fading, self.state.signals, end, WAYS)
         last[..., -1] += added[..., -1]
         steep_first = horner(parts.derivative, begin) + steeper
         steep_last = horner(parts.derivative, end) + steeper_last
@@ -162,7 +162,7 @@ class PreparedInverse:
             middle = 0.5 * rise
             way = ((cube * middle + square) * middle + one) * middle
             error = horner(curve, begin + way) + waiting - first - middle
-            error += parts.added(self.state, begin + way, WAYS)[0]
+            error += parts.fading.along(self.state.fading, self.state.signals, begin + way, WAYS)[0]
         cube[~(np.abs(error) <= EXACT)] = np.nan
         return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
 
