@@ -110,15 +110,12 @@ class HysteresisModel:
             shape = getattr(self, name).shape
             if len(shape) not in (2, 3) or shape[-2] != rows:
                 raise ValueError(f"{name} has the shape {shape}: must be {rows} rows")
-        if self.creep_spectrum.size and self.creep_spectrum.shape[-1] != len(self.creep_time):
-            raise ValueError(
-                f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {len(self.creep_time)} columns"
-            )
-        if self.lag_spectrum.size and self.lag_spectrum.shape[-1] > len(self.creep_time):
-            raise ValueError(
-                f"lag_spectrum has the shape {self.lag_spectrum.shape}: must be at most {len(self.creep_time)} columns"
-            )
-        expected = (2, 1 + len(self.creep_time), 1 + len(self.creep_time))
+        count = len(self.creep_time)
+        if self.creep_spectrum.size and self.creep_spectrum.shape[-1] != count:
+            raise ValueError(f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {count} columns")
+        if self.lag_spectrum.size and self.lag_spectrum.shape[-1] > count:
+            raise ValueError(f"lag_spectrum has the shape {self.lag_spectrum.shape}: must be at most {count} columns")
+        expected = (2, 1 + count, 1 + count)
         if self.creep_covariance.size and self.creep_covariance.shape != expected:
             raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")
         if len({shape for shape in self._own if shape}) > 1:
@@ -219,9 +216,7 @@ class HysteresisModel:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
-        lagged = state.lagged
-        if lagged.size:
-            lagged = state.signals[:, None] + (lagged - state.signals[:, None]) * rest[: lagged.shape[1]]
+        lagged = state.signals[:, None] + (state.lagged - state.signals[:, None]) * rest[: state.lagged.shape[1]]
         return replace(state, time=time, crept=crept, crept_sigma=state.crept_sigma * rest, lagged=lagged)
 
     def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
@@ -249,8 +244,6 @@ class HysteresisModel:
     def static_of(self, effective: Floats, grown: Floats, faded: Floats) -> Floats:
         """(N,) static effective signals p that solve `effective` (N,) = p + (1 + creep_slope p) (grown p + faded)."""
         slope, rest = self.creep_slope, effective - faded
-        if not slope:
-            return np.asarray(rest / (1.0 + grown))
         linear = 1.0 + grown + slope * faded
         return np.asarray(2.0 * rest / (linear + np.sqrt(np.maximum(linear**2 + 4.0 * slope * grown * rest, 0.0))))
 
