@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
-from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.interferometer_parameters import load_reference
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.map_files.fits import fits_bytes
 from dm_calibration.optics.orientation import Orientation

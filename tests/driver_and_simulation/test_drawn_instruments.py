@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.acquisition.ingest import Ingest
-from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.interferometer_parameters import load_reference
 from dm_calibration.map_files import SurfaceMap
 from dm_common.figures import two_fold
 from dm_common.optics.zernike import PISTON_TILT

@@ -9,8 +9,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
-from dm_calibration.acquisition.reference_surface import load_reference
-from dm_calibration.map_files import SurfaceMap
+from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of
@@ -80,3 +79,24 @@ def configure(
     folder = Path(values["watch_folder"]).expanduser() if values["watch_folder"] else None
     settings = from_values(AcquisitionSettings, values, folder=folder)
     return settings, load_reference(path, unit, *expected) if path else None
+
+
+def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float) -> SurfaceMap:
+    """The reference surface in a map file.
+
+    Args:
+        wavelength: expected of the instrument, m; 0 = any.
+
+    Raises:
+        ValueError: not a readable map, or one of another wavelength.
+    """
+    try:
+        reference = read_map(Path(path).expanduser(), xyz_unit=xyz_unit or None)
+    except MapFileError as error:
+        raise ValueError(f"reference_surface: {error}") from error
+    if wavelength and reference.wavelength and abs(reference.wavelength - wavelength) > tolerance:
+        raise ValueError(
+            f"reference_surface = {path!r}: wavelength {reference.wavelength * 1e9:.3f} nm, must be "
+            f"{wavelength * 1e9:.3f} nm as the instrument's (wavelength.expected)"
+        )
+    return reference

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
-from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.interferometer_parameters import load_reference
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap, read_map
 from dm_calibration.map_files.fits import fits_bytes
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError

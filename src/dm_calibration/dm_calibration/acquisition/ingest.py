@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dm_calibration.acquisition.reference_surface import difference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, MapRejectedError, find_aperture
 from dm_calibration.optics.instrument import undistorted, without_retrace
@@ -167,7 +166,7 @@ class Ingest:
         pitch = settings.pitch or source.pitch
         sag, subtracted = source.sag, source.system_error_subtracted
         if settings.reference is not None:
-            if different := difference(source, settings.reference, settings.pitch, settings.wavelength_tolerance):
+            if different := source.difference(settings.reference, settings.pitch, settings.wavelength_tolerance):
                 raise MapRejectedError(different)
             sag, subtracted = sag - settings.reference.sag, True
         if settings.retrace:

@@ -1,5 +1,7 @@
 """A measured surface map, as every reader of this package returns it, and checks that the readers share."""
 
+from __future__ import annotations
+
 import hashlib
 import math
 from collections.abc import Mapping
@@ -108,6 +110,29 @@ class SurfaceMap:
     def rms(self) -> float:
         """Standard deviation of `sag` over all its valid pixels, m."""
         return float(np.std(self.sag[self.valid]))
+
+    def difference(
+        self, reference: SurfaceMap, pitch: float, wavelength_tolerance: float, name: str = "reference_surface"
+    ) -> str:
+        """Why `reference`, called `name` in the sentence, cannot be subtracted from this map; "" = it can.
+
+        Either they differ in size, place on the camera, pitch or wavelength, or the instrument has already subtracted
+        its error from the map. `pitch`: m per pixel, for files that do not contain it; 0 = not known.
+        """
+        size = "{1} x {0} pixels from column {2}, row {3} of the camera"
+        here, there = ((*each.sag.shape, *each.origin) for each in (self, reference))
+        pitches = [each.pitch or pitch for each in (self, reference)]
+        if here != there:
+            return f"{size.format(*here)}, {name} has {size.format(*there)}"
+        if all(pitches) and abs(pitches[0] - pitches[1]) > PITCH_TOLERANCE * pitches[1]:
+            return f"pitch {pitches[0] * 1e6:.3f} um, {name} has {pitches[1] * 1e6:.3f} um"
+        if reference.wavelength and abs(self.wavelength - reference.wavelength) > wavelength_tolerance:
+            return f"wavelength {self.wavelength * 1e9:.3f} nm, {name} has {reference.wavelength * 1e9:.3f} nm"
+        if self.system_error_subtracted:
+            return (
+                "the instrument has subtracted its own error already: leave reference_surface empty, or switch that off"
+            )
+        return ""
 
 
 def _outside(name: str, value: object, allowed: str) -> MapFileError:

@@ -80,7 +80,6 @@ def instrument(
 
 def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
     """Write the error of the flat that is the first reference in `table`."""
-    from dm_calibration.acquisition.reference_surface import difference
     from dm_calibration.map_files.fits import fits_bytes
     from dm_calibration.optics.flats import FlatTest, reference_from_flats
     from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
@@ -92,7 +91,7 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     surfaces = [read(source) for source in sources]
     tolerance = WAVELENGTH_TOLERANCE * surfaces[0].wavelength
     for source, surface in zip(sources, surfaces, strict=True):
-        if different := difference(surface, surfaces[0], 0.0, tolerance, str(sources[0])):
+        if different := surface.difference(surfaces[0], 0.0, tolerance, str(sources[0])):
             raise ValueError(f"{source}: {different}")
     tests = [
         FlatTest(surface.sag, reference, part, math.radians(float(degrees)))
