@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import complete_sag
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
@@ -41,7 +40,7 @@ from dm_calibration.regression.surface_error import (
 )
 from dm_common import Floats
 from dm_common.errors import unknown_name
-from dm_common.optics.piston_tilt import rms
+from dm_common.optics.piston_tilt import fill_gaps, rms
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.paper.reported import TEST_SURFACES
 
@@ -121,12 +120,11 @@ class LinearHistory:
 
     def __init__(self, maps: MapSet, model: Floats) -> None:
         """`model`: (M, P) m, sag that replaces points without data."""
-        self._usable, self._sag = complete_sag(maps, model)
+        self._sag = fill_gaps(maps.sag, model, maps.points)
         self._design = np.column_stack((np.ones(len(maps)), maps.applied))
 
     def predict(self, keep: NDArray[np.bool_]) -> Floats:
         """(M, P) m: sag of every command of the run, by the model that best explains the maps in `keep` (M,)."""
-        keep = keep & self._usable
         return np.asarray(self._design @ np.linalg.lstsq(self._design[keep], self._sag[keep], rcond=1e-9)[0])
 
 

@@ -155,18 +155,6 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     )
 
 
-def complete_sag(maps: MapSet, model: Floats) -> tuple[Bools, Floats]:
-    """Which maps hold data (M,), and their sag (M, P) m with piston and tilt removed; that of the others is zero.
-
-    Args:
-        model: (M, P) m, sag used to fill points without data.
-    """
-    usable: Bools = np.asarray(np.isfinite(maps.sag).any(axis=1))
-    sag = np.zeros_like(maps.sag)
-    sag[usable] = fill_gaps(maps.sag[usable], model[usable], maps.points)
-    return usable, sag
-
-
 class SeenAlike(NamedTuple):
     """Sampling points with data in the same maps, by index; p unknowns, L maps without data there.
 

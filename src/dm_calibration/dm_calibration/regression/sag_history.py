@@ -17,9 +17,10 @@ from dm_calibration.hysteresis.features import play_features
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import BEFORE_FIRST_MAP_S, Run, without
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import complete_sag, drift_columns
+from dm_calibration.influence.regression import drift_columns
 from dm_common import Bools, Floats
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
+from dm_common.optics.piston_tilt import fill_gaps
 
 #: Half-widths of the play operators beside the signal itself, normalised.
 PLAY_RADII = (0.05, 0.15, 0.3, 0.5, 0.75)
@@ -53,19 +54,18 @@ class RunHistory:
             model: (M, P) m, sag used to fill points without data.
         """
         self._maps = maps
-        self._usable, self._sag = complete_sag(maps, model)
+        self._sag = fill_gaps(maps.sag, model, maps.points)
         self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step)
         self._radius = np.array((0.0, *PLAY_RADII))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # even if the clock was set back
         moved = np.clip(maps.moved_s(), np.concatenate(([-BEFORE_FIRST_MAP_S], time[:-1])), time)
-        responses = Responses(self._sag, 0, self._usable)
+        responses = Responses(self._sag, 0, np.asarray(np.isfinite(maps.sag).any(axis=1)))
         run = Run(maps.applied, time, responses, -BEFORE_FIRST_MAP_S, moved, maps.segment, maps.degaussed, maps.rest)
         self._plays = run.along(lambda signals: play_features(signals, self._radius, 1, maps.rest))
         self._crept = run.crept(self._plays)
 
     def fit(self, keep: Bools) -> SagModel:
-        """The model that explains the maps in `keep` (M,) best."""
-        keep = keep & self._usable
+        """The model that explains the maps in `keep` (M,), which hold data, best."""
         area = np.sqrt(self._maps.points.weight)
         figure, sag = self._figure[keep], self._sag[keep] * area
         free = np.linalg.qr(figure)[0]  # what the figure explains is no evidence on the weights
