@@ -246,15 +246,3 @@ def random_histories(
         for _ in range(HISTORY_MOVES):
             state = law.move(state, rng.uniform(low, high, count), state.time + HISTORY_PAUSE_S)
         yield state
-
-
-def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
-    """Range of effective signals that signals of `low` .. `high` reach whatever the history.
-
-    Hysteresis and creep narrow it; each end is the least that any of the random histories leaves.
-    """
-    ends: dict[float, list[Floats]] = {low: [], high: []}
-    for state in random_histories(law, low, high, np.random.default_rng(0)):
-        for end, reached in ends.items():
-            reached.append(law.effective(law.move(state, np.full(len(state.signals), end), state.time)))
-    return float(np.max(ends[low])), float(np.min(ends[high]))

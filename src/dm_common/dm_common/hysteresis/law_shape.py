@@ -7,7 +7,7 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.hysteresis.duhem import FadingHysteresis, horner
-from dm_common.hysteresis.inverse import certain_reach, pieces
+from dm_common.hysteresis.inverse import pieces, random_histories
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
@@ -68,10 +68,17 @@ def normalised(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Hy
 
 
 def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
-    """Limits on effective signals that signals within `limits` reach whatever the history, see `certain_reach`."""
+    """Limits on effective signals that signals within `limits` reach whatever the history.
+
+    Hysteresis and creep narrow the range; each end is the least that any of the random histories leaves.
+    """
     if law.is_identity:
         return limits
-    low, high = certain_reach(law, limits.low, limits.high)
+    ends: dict[float, list[Floats]] = {limits.low: [], limits.high: []}
+    for state in random_histories(law, limits.low, limits.high, np.random.default_rng(0)):
+        for end, reached in ends.items():
+            reached.append(law.effective(law.move(state, np.full(len(state.signals), end), state.time)))
+    low, high = float(np.max(ends[limits.low])), float(np.min(ends[limits.high]))
     share = min((high - low) / (limits.high - limits.low), 1.0)
     return replace(limits, low=low, high=high, neighbour_difference=share * limits.neighbour_difference)
 
