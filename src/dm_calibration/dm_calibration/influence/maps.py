@@ -146,13 +146,11 @@ class MapSet:
 
     @classmethod
     def of(cls, measured: Sequence[Measurement]) -> MapSet:
-        """Stack maps of the same points, in the order measured.
+        """Stack maps of the same points, at least one, in the order measured.
 
         Raises:
-            ValueError: when there is none, or lengths differ between maps.
+            ValueError: lengths differ between maps.
         """
-        if not measured:
-            raise ValueError("no maps were measured")
         unknown = np.full(measured[0].coefficients.shape, np.nan)
         columns: dict[str, Any] = {"points": measured[0].points}
         for name in cls.columns():

@@ -83,8 +83,6 @@ class BumpCheck:
         if self._last is None:
             return ""
         last, options = self._last.record, self._options
-        if frame.record.coefficients.shape != last.coefficients.shape:
-            return ""
         difference = frame.record.coefficients - last.coefficients
         tilt = float(np.hypot(difference[1], difference[2]))
         if options.tilt_max and not interrupted and tilt > options.tilt_max:
