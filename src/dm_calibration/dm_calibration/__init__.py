@@ -3,8 +3,6 @@
 `calibrate` makes a calibration from maps; `identify_response` compares hysteresis laws on any linear measurement.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

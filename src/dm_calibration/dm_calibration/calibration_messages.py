@@ -1,7 +1,5 @@
 """Conversion between the messages of dm_msgs and the types of the calibration library."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ found by alternating least squares. The few parameters that enter nonlinearly (s
 are found by Gauss-Newton around that (variable projection [14]).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
