@@ -111,9 +111,8 @@ def choose_weighting(
     fractions = np.array((0.0, *EPSILON_CANDIDATES))  # 0 stands for no weights at all
     variance = _variance(design, maps, sag, chosen)
     scale = float(np.median(variance))
-
-    # Which held-out predictions are extrapolation does not depend on the responses, so any column will do.
-    _, tested = quality.held_out_residual(design, sag[:, :1], fold)
+    held_out, tested = quality.held_out_residual(design, sag, fold)
+    predicted = sag - held_out
     tested = tested if tested.any() else chosen
     squares = np.zeros(fractions.size)
     modes = basis(maps.points.x, maps.points.y)
@@ -123,11 +122,10 @@ def choose_weighting(
         if not judged.any():
             continue
         train = Design(design.matrix[~left_out], design.drift, design.excited)
-        predicted = design.matrix[judged] @ (np.linalg.pinv(train.matrix, rcond=1e-9) @ sag[~left_out])
         r = _variance(train, maps.select(~left_out), sag[~left_out], chosen[~left_out])
         for e, share in enumerate(fractions):
             weights = region_weights(r, share * scale) if share else np.ones(len(AREA_FRACTIONS))
-            terms = predicted @ coefficient_operator(maps.points, weights).T
+            terms = predicted[judged] @ coefficient_operator(maps.points, weights).T
             error = remove_piston_tilt(sag[judged] - terms @ modes.T, maps.points)
             squares[e] += np.square(regional_rms(error, maps.points)).sum()
     score = np.sqrt(squares / (len(AREA_FRACTIONS) * max(int((tested & chosen).sum()), 1)))
