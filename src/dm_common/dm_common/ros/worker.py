@@ -108,12 +108,6 @@ class WorkerService:
         elif self._node.executor is not None:
             self._node.executor.create_task(self._send, answer, header)
 
-    def destroy(self) -> None:
-        """Stop taking requests and drop those not yet begun."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        self._ends.shutdown(wait=False, cancel_futures=True)
-        self._node.destroy_service(self._service)
-
 
 class WorkerGoal:
     """A goal as its body sees it: also cancelled by the deactivation of its node, or by a goal that takes over.
