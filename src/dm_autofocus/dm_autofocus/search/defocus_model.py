@@ -245,13 +245,8 @@ def _transfer_table(edges: Floats, lens: FocusLens, length: int) -> Floats:
     x = (nodes + 1) / 2 * half
     chord = weights / 2 * half * np.sqrt(np.maximum(1 - (x + shift[..., None] / 2) ** 2, 0))
     phase = np.pi * STEP * shift[..., None] * x  # of one step: a depth of focus is a quarter wave
-    table = np.empty((length, len(frequency)))
-    twice, cosine, before = 2 * np.cos(phase), np.ones_like(phase), np.cos(phase)
-    for number in range(length):
-        amplitude = 4 / np.pi * np.sum(chord * cosine, axis=-1)
-        table[number] = np.average(amplitude**2, axis=1, weights=frequency)
-        cosine, before = twice * cosine - before, cosine  # cos((n + 1) a) = 2 cos(a) cos(n a) - cos((n - 1) a)
-    return table
+    amplitude = [4 / np.pi * np.sum(chord * np.cos(number * phase), axis=-1) for number in range(length)]
+    return np.asarray(np.sum(np.square(amplitude) * frequency, axis=2) / frequency.sum(1))
 
 
 def _envelope(table: Floats) -> Floats:
