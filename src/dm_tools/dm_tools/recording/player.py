@@ -6,12 +6,11 @@ from contextlib import closing
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from dm_client.connection import Connection
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Topic
 from dm_tools.recording.interfaces import UnknownTypeError, message_class
-from dm_tools.recording.recorder import COMMON
+from dm_tools.recording.recorder import COMMON, profile_for
 
 #: Topics that would move a real mirror; published only when asked for.
 COMMANDS = ("actuator_command", "focus_request")
@@ -82,7 +81,9 @@ def play(
             except UnknownTypeError as error:  # a recording of all topics may hold those of any other program
                 remark(f"{topic.name} is left out: {error}")
             else:
-                publishers[topic.name] = node.create_publisher(kind, topic.name, _offer(topic))
+                loose = {offer.reliability.name for offer in topic.qos} == {"BEST_EFFORT"}
+                profile = profile_for(topic, DEPTH, reliable=not loose)
+                publishers[topic.name] = node.create_publisher(kind, topic.name, profile)
         time.sleep(DISCOVERY_S)
         for name in publishers:
             _check_no_driver(node, name)
@@ -118,14 +119,3 @@ def _has_changed(node: Node, topic: Topic) -> bool:
     """Whether the type of `topic` has another layout than was recorded, as far as is known."""
     published = [info for info in node.get_publishers_info_by_topic(topic.name) if info.node_name == node.get_name()]
     return topic.type_hash.startswith("RIHS") and topic.type_hash not in {str(o.topic_type_hash) for o in published}
-
-
-def _offer(topic: Topic) -> QoSProfile:
-    """The quality of service that the recorded publishers had in common."""
-    loose = {profile.reliability.name for profile in topic.qos} == {"BEST_EFFORT"}
-    latched = {profile.durability.name for profile in topic.qos} == {"TRANSIENT_LOCAL"}
-    return QoSProfile(
-        depth=DEPTH,
-        reliability=ReliabilityPolicy.BEST_EFFORT if loose else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )

@@ -161,8 +161,8 @@ class Recorder:
         if not publishers:
             return  # its type and quality of service are not known yet
         self._subscribed.add(name)
-        profiles = [publisher.qos_profile for publisher in publishers]
-        topic = Topic(name, type_name, [offered(profile) for profile in profiles], str(publishers[0].topic_type_hash))
+        offers = [offered(publisher.qos_profile) for publisher in publishers]
+        topic = Topic(name, type_name, offers, str(publishers[0].topic_type_hash))
         try:
             self._jobs.put(partial(self._bag.add_topic, topic, definition(type_name)))
         except UnknownTypeError as error:
@@ -172,7 +172,8 @@ class Recorder:
         def take(data: bytes) -> None:
             self._jobs.put(partial(self._bag.write, name, data, self._now_ns()))
 
-        self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
+        profile = profile_for(topic, DEPTH, all(offer.reliability.name == "RELIABLE" for offer in offers))
+        self._node.create_subscription(message_class(type_name), name, take, profile, raw=True)
 
     def _ask_parameters(self) -> None:
         """Ask each node of the suite for its parameters, once after every start of it; the answers come later."""
@@ -233,12 +234,11 @@ class Recorder:
                     self._failure = error
 
 
-def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """Quality of service that matches all publishers, and receives latched messages if all of them are latched."""
-    reliable = all(profile.reliability is ReliabilityPolicy.RELIABLE for profile in offered)
-    latched = all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
+def profile_for(topic: Topic, depth: int, reliable: bool) -> QoSProfile:
+    """Quality of service for a topic: `reliable`, and latched if all its publishers are."""
+    latched = {offer.durability.name for offer in topic.qos} == {"TRANSIENT_LOCAL"}
     return QoSProfile(
-        depth=DEPTH,
+        depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
