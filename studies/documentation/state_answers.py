@@ -43,10 +43,11 @@ AT_REST = (
 
 def _wrong(value: Value) -> Iterator[Any]:
     """Wrong values: of another type; for numbers, also beyond the largest, and NaN."""
-    yield 1.5 if value.kind is str else "nonsense"
-    if value.kind in (int, float) and math.isfinite(value.high):
-        yield value.item(2 * value.high + 1)
-    if value.kind is float:
+    kind = None if value.many else value.kind
+    yield 1.5 if kind is str else "nonsense"
+    if kind in (int, float) and math.isfinite(value.high):
+        yield value.kind(2 * value.high + 1)
+    if kind is float:
         yield math.nan
 
 

@@ -173,7 +173,7 @@ def test_shipped_configurations_name_only_parameters_that_exist(name: str) -> No
         for parameter, value in values.items():
             assert parameter in known, f"{name}: {node} has no parameter {parameter}"
             known[parameter].check(value)
-            if known[parameter].value.kind is float:
+            if known[parameter].value.kind is float and not known[parameter].value.many:
                 assert isinstance(value, float), f"{name}: {node}.{parameter} must be written with a point"
     required = {parameter.name for parameter in TABLES["pdm_driver"] if parameter.default is REQUIRED}
     assert required <= config["pdm_driver"].keys()

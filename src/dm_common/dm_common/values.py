@@ -27,7 +27,7 @@ class Value:
     """Constraints on a value; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
 
     Attributes:
-        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
+        kind: bool, int, float or str; of an array that of its elements.
         default: the value when none is given.
         low, high: allowed range of numbers (of each element for arrays), inclusive.
         unit: SI unit, "" when it has none.
@@ -35,10 +35,11 @@ class Value:
         path: whether a string is a path, in which ~ must stand for an existing home folder.
         zero: meaning of 0, which is then allowed even outside the range; "" = no special meaning.
         infinite: whether infinity is allowed; NaN never is.
+        many: whether it is an array.
         sizes: numbers of elements that an array may have.
     """
 
-    kind: type | str
+    kind: type
     default: Any
     low: float = -math.inf
     high: float = math.inf
@@ -47,27 +48,18 @@ class Value:
     path: bool = False
     zero: str = ""
     infinite: bool = False
+    many: bool = False
     sizes: Sequence[int] = range(100_001)
-
-    @property
-    def many(self) -> bool:
-        """Whether it is an array."""
-        return isinstance(self.kind, str)
-
-    @property
-    def item(self) -> type:
-        """The type of the value, of an array that of its elements."""
-        return {"float[]": float, "int[]": int, "str[]": str}[self.kind] if isinstance(self.kind, str) else self.kind
 
     def allowed(self) -> str:
         """The allowed values as text, the type first."""
         if self.choices:
             return "one of " + ", ".join(choice or "empty" for choice in self.choices)
-        kind = self.item.__name__ + ("[]" if self.many else "")
+        kind = self.kind.__name__ + ("[]" if self.many else "")
         if math.isinf(self.low) and math.isinf(self.high):
-            return f"a finite {kind}" if self.item is float else f"a {kind}"
+            return f"a finite {kind}" if self.kind is float else f"a {kind}"
         zero = f", or 0 ({self.zero})" if self.zero else ""
-        low, high = (f"{limit:{'g' if self.item is float else '.10g'}}" for limit in (self.low, self.high))
+        low, high = (f"{limit:{'g' if self.kind is float else '.10g'}}" for limit in (self.low, self.high))
         return f"{kind}, {low} to {high}{' ' + self.unit if self.unit else ''}{zero}"
 
     def check(self, name: str, given: Any) -> None:
@@ -77,10 +69,10 @@ class Value:
             Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts), INVALID_ARGUMENT (control
                 characters), UNKNOWN_NAME (choices, users in paths).
         """
-        if self.kind is str:
-            self._check_text(name, given)
-        elif isinstance(self.kind, str):
+        if self.many:
             self._check_array(name, given)
+        elif self.kind is str:
+            self._check_text(name, given)
         # Most numbers are right, and a request on its way to the mirror waits for this: without NumPy.
         elif not (self.low <= given <= self.high and (self.infinite or math.isfinite(given))):
             self._check_numbers(name, np.array([given], dtype=float), f"{name} = {given}")
@@ -92,7 +84,7 @@ class Value:
             ends = (self.sizes[0], self.sizes[-1]) if isinstance(self.sizes, range) else self.sizes
             sizes = between.join(map(str, ends))
             raise Refusal(ErrorCode.INVALID_LENGTH, f"{name} has {size} values: must have {sizes}")
-        if self.item is str:
+        if self.kind is str:
             for place, item in enumerate(given):
                 self._check_text(f"{name}[{place}]", item)
         elif size:
@@ -135,7 +127,7 @@ class Value:
 
 
 real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))
-reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
+reals, wholes, texts = (partial(Value, kind, many=True) for kind in (float, int, str))
 
 
 def parameter(value: Value, description: str, live: bool = False, name: str = "") -> Any:

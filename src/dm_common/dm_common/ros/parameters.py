@@ -21,14 +21,15 @@ from rclpy.parameter import Parameter as RosParameter
 from dm_common.errors import Refusal, unknown_name
 from dm_common.values import Value, switch
 
-_TYPES: dict[type | str, RosParameter.Type] = {
-    bool: RosParameter.Type.BOOL,
-    int: RosParameter.Type.INTEGER,
-    float: RosParameter.Type.DOUBLE,
-    str: RosParameter.Type.STRING,
-    "float[]": RosParameter.Type.DOUBLE_ARRAY,
-    "int[]": RosParameter.Type.INTEGER_ARRAY,
-    "str[]": RosParameter.Type.STRING_ARRAY,
+#: By the type of a value, or of the elements of an array, and whether it is one.
+_TYPES = {
+    (bool, False): RosParameter.Type.BOOL,
+    (int, False): RosParameter.Type.INTEGER,
+    (float, False): RosParameter.Type.DOUBLE,
+    (str, False): RosParameter.Type.STRING,
+    (float, True): RosParameter.Type.DOUBLE_ARRAY,
+    (int, True): RosParameter.Type.INTEGER_ARRAY,
+    (str, True): RosParameter.Type.STRING_ARRAY,
 }
 
 #: Marks a parameter that the configuration must give.
@@ -77,9 +78,9 @@ class Parameter:
         value = self.value
         many = isinstance(given, list | tuple | array)
         items = [
-            float(item) if value.item is float and type(item) is int else item for item in (given if many else [given])
+            float(item) if value.kind is float and type(item) is int else item for item in (given if many else [given])
         ]
-        if many != value.many or any(type(item) is not value.item for item in items):
+        if many != value.many or any(type(item) is not value.kind for item in items):
             raise ParameterError(f"{self.name} = {given!r}: must be {self.value.allowed()}")
         checked = items if many else items[0]
         try:
@@ -95,18 +96,18 @@ class Parameter:
 
     def as_ros(self, value: Any) -> RosParameter:
         """The ROS parameter with a value that `check` returned."""
-        return RosParameter(self.name, _TYPES[self.value.kind], value)
+        return RosParameter(self.name, _TYPES[self.value.kind, self.value.many], value)
 
     def descriptor(self, read_only: bool = False) -> ParameterDescriptor:
         value = self.value
         descriptor = ParameterDescriptor(
             name=self.name,
-            type=_TYPES[value.kind].value,
+            type=_TYPES[value.kind, value.many].value,
             description=self.describe(),
             additional_constraints=value.allowed(),
             read_only=read_only,
         )
-        bounded = not (math.isinf(value.low) and math.isinf(value.high))
+        bounded = not (value.many or (math.isinf(value.low) and math.isinf(value.high)))
         if value.kind is float and bounded:
             descriptor.floating_point_range = [FloatingPointRange(from_value=value.low, to_value=value.high)]
         if value.kind is int and bounded:
@@ -241,9 +242,10 @@ def _declared(node: Node, known: Mapping[str, Parameter]) -> Values:
             values[name] = parameter.check(value)
         except ParameterError as error:
             values[name], values.problems[name] = parameter.blank, str(error)
+        first = parameter.as_ros(values[name])
         # An array declared by its type alone has no value, which hides all others from `ros2 param dump`.
-        node.declare_parameter(name, _TYPES[parameter.value.kind], parameter.descriptor(), ignore_override=True)
-        node.set_parameters([parameter.as_ros(values[name])])
+        node.declare_parameter(name, first.type_, parameter.descriptor(), ignore_override=True)
+        node.set_parameters([first])
     for name in given:
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             _judge_unknown(node, name, known, values)
@@ -260,14 +262,14 @@ def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
     try:
         return parameter.as_ros(parameter.check([] if empty else _numbers(parameter.value, change.value)))
     except ParameterError as error:
-        if change.type_ == _TYPES[parameter.value.kind]:
+        if change.type_ == _TYPES[parameter.value.kind, parameter.value.many]:
             return change
         raise _RefusedParameterError(str(error)) from error  # rclpy's own message on a wrong type names no parameter
 
 
 def _numbers(value: Value, given: Any) -> Any:
     """Convert `given` where YAML took floats for text, as it (and `ros2 param`) does with 3e-08."""
-    if value.item is not float:
+    if value.kind is not float:
         return given
     texts = given.strip("[]").split(",") if value.many and isinstance(given, str) else given
     with suppress(ValueError):
