@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import in_nanometres, two_fold, with_point
-from dm_tools.boresight import run_boresight
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -222,6 +221,8 @@ def calibrate(
         of_calibration = (dry_run, fresh, until, note, surfaces, amplitude, settle, hysteresis is not None)
         if any(of_calibration) or (plan, maps_per_state, activate) != (CalibrationPlan.hysteresis, 1, True):
             raise typer.BadParameter("--boresight takes no option of a calibration: it moves the mirror, by images")
+        from dm_tools.boresight import run_boresight
+
         run_boresight(namespace, region, image_topic, take_over, write, config, json)
         return
     if (region, image_topic) != (REGION, IMAGE_TOPIC):
