@@ -222,7 +222,7 @@ def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
         configuring = node.load_configuring()
         assert configuring is not None
         try:
-            configuring(doctor_bench.effective(name, GOOD.get(name, {}) | values))
+            configuring({item.name: item.default for item in node.load_parameters()} | GOOD.get(name, {}) | values)
         except ValueError as error:
             reached |= set(_raising(error))
     # What no values come to that the parameters' table allows, and what is not of a configuration.

@@ -47,41 +47,28 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
     for node in nodes_of(config):
         if node.configuring:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
-    # Wrong values have been reported above; the checks below use only the valid ones.
-    sound = {node: sound_values(node, values) for node, values in config.items()}
-    yield "aperture of the maps", lambda: aperture_fits(sound)
-    yield "record of creep", lambda: one_record(sound)
-    yield "trigger command", lambda: trigger_program(sound.get("interferometer", {}).get("trigger_command", []))
-    driver = sound.get("pdm_driver", {})
-    if "virtual_bench" in config:
-        yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
+    yield "aperture of the maps", lambda: aperture_fits(config)
+    yield "record of creep", lambda: one_record(config)
+    interferometer, driver = (effective(name, config.get(name, {})) for name in ("interferometer", "pdm_driver"))
+    yield "trigger command", lambda: trigger_program(interferometer["trigger_command"])
+    made = "virtual_bench" in config
+    if made:
+        yield "ports of the virtual bench", lambda: taken_ports(config["virtual_bench"])
     else:
-        yield from electronics_checks(effective("pdm_driver", driver))
+        yield from electronics_checks(driver)
     for name in ("pdm_driver", "focus_controller"):
-        if folder := effective(name, sound.get(name, {}))["state_folder"]:
+        if folder := effective(name, config.get(name, {}))["state_folder"]:
             yield f"state folder of {name}", partial(writable_folder, ros_home(folder))
-    watched = _folder_of(sound, "interferometer", "watch_folder")
-    if watched is not None:
-        writes = "{path}" in " ".join(sound["interferometer"].get("trigger_command", []))
-        made = "virtual_bench" in config
+    if interferometer["watch_folder"]:
+        watched = Path(interferometer["watch_folder"]).expanduser()
+        writes = "{path}" in " ".join(interferometer["trigger_command"])
         yield f"watched folder {watched}", lambda: watched_folder(watched, writes, made)
-    store = _folder_of(sound, "calibration", "calibration_folder")
-    if store is not None:
+    if config.get("calibration", {}).get("calibration_folder"):
+        calibration = effective("calibration", config["calibration"])
+        store = Path(calibration["calibration_folder"]).expanduser()
         yield f"calibration folder {store}", lambda: writable_folder(store)
-        values = effective("calibration", sound["calibration"])
-        if serial := driver.get("mirror.serial"):
-            yield "calibration", lambda: stored_calibration(store, serial, values["updates.stale_after"])
-
-
-def sound_values(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a node that are set and valid."""
-    known, problems = _known(node), _problems(node, values)
-    return {name: value for name, value in values.items() if name in known and value != UNSET and name not in problems}
-
-
-def _folder_of(config: Config, node: str, name: str) -> Path | None:
-    text = config.get(node, {}).get(name, "")
-    return Path(text).expanduser() if text else None
+        if (serial := driver["mirror.serial"]) not in ("", REQUIRED):
+            yield "calibration", lambda: stored_calibration(store, serial, calibration["updates.stale_after"])
 
 
 @cache
@@ -91,8 +78,10 @@ def _known(name: str) -> dict[str, Parameter]:
 
 
 def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """All values of a node: those `given`, and defaults for the others."""
-    return {item.name: item.default for item in _known(name).values()} | dict(given)
+    """All values of a node: of those `given` the ones that are set and valid, and defaults for the others."""
+    problems = _problems(name, given)
+    valid = {key: value for key, value in given.items() if value != UNSET and key not in problems}
+    return {item.name: item.default for item in _known(name).values()} | valid
 
 
 def required_parameters(config: Config) -> Finding | None:
@@ -175,12 +164,11 @@ def trigger_program(command: Sequence[str]) -> Finding | None:
 
 
 def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Ports of the bench that other programs hold; None = all are free. A wrong value is skipped."""
-    sound, taken = sound_values("virtual_bench", bench), []
-    values = effective("virtual_bench", sound)
+    """Ports of the bench that other programs hold; None = all are free. For a wrong value its default is tried."""
+    values, taken = effective("virtual_bench", bench), []
     for name, protocol in BENCH_PORTS.items():
         port, kind = values[name], socket.SOCK_STREAM if protocol == "TCP" else socket.SOCK_DGRAM
-        if port <= 0 or (name in bench and name not in sound):
+        if port <= 0:
             continue
         with socket.socket(socket.AF_INET, kind) as probe:
             if kind == socket.SOCK_STREAM:

@@ -84,7 +84,7 @@ def up(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores it
             signal.signal(number, lambda _number, _frame: stop.set())
-    from dm_tools.doctor.bench import effective, sound_values, taken_ports
+    from dm_tools.doctor.bench import effective, taken_ports
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
@@ -107,7 +107,7 @@ def up(
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
             if kind == "virtual bench":
-                bench = effective("virtual_bench", sound_values("virtual_bench", configuration["virtual_bench"]))
+                bench = effective("virtual_bench", configuration["virtual_bench"])
                 console.print(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
@@ -236,9 +236,9 @@ def check_apart(mirrors: Mapping[str, Config]) -> None:
 def _own(config: Config) -> Iterator[tuple[str, Any]]:
     """Resources that no two mirrors may share, with the names of their parameters."""
     from dm_driver.electronics import BACK_ENDS
-    from dm_tools.doctor.bench import BENCH_PORTS, effective, sound_values
+    from dm_tools.doctor.bench import BENCH_PORTS, effective
 
-    values = {node: effective(node, sound_values(node, given)) for node, given in config.items()}
+    values = {node: effective(node, given) for node, given in config.items()}
     driver, bench = values["pdm_driver"], values.get("virtual_bench", {})
     folder = effective("calibration", values.get("calibration", {}))["calibration_folder"]
     yield (
