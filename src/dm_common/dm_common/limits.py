@@ -94,14 +94,9 @@ class Limits:
         """
         mean = float(np.clip(signals.mean(), self.low, self.high))
         departure = signals - signals.mean()
-        factor = 1.0
-        if departure.max(initial=0.0) > self.high - mean:
-            factor = min(factor, (self.high - mean) / departure.max())
-        if -departure.min(initial=0.0) > mean - self.low:
-            factor = min(factor, (mean - self.low) / -departure.min())
-        largest = self.differences(signals).max(initial=0.0)
-        if largest > self.neighbour_difference:
-            factor = min(factor, self.neighbour_difference / largest)
+        largest = (values.max(initial=0.0) for values in (departure, -departure, self.differences(signals)))
+        allowed = (self.high - mean, mean - self.low, self.neighbour_difference)
+        factor = min([1.0, *(most / size for size, most in zip(largest, allowed, strict=True) if size > most)])
         if factor == 1.0:
             return np.clip(signals, self.low, self.high), 1.0
         # Rounding must not leave a value slightly above a limit that the driver checks exactly.
