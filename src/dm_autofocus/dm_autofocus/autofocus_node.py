@@ -24,7 +24,7 @@ from dm_common.ros import qos
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import OK, WARN, Health, ManagedNode
-from dm_common.ros.worker import WorkerService, never_silent
+from dm_common.ros.worker import WorkerService
 from dm_common.values import Fields, real, without_figures
 
 SET_FOCUS_DISTANCE = Fields(
@@ -44,8 +44,7 @@ class AutofocusNode(ManagedNode):
         for action in (AutofocusAction, FocusStackAction):
             action(self, self._probe, self._values, lambda: self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance, SET_FOCUS_DISTANCE)
-        answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
-        self.create_service(GetFocusRange, "get_focus_range", answer, qos_profile=qos.SERVICE)
+        WorkerService(self, GetFocusRange, "get_focus_range", self._on_get_focus_range)
         self._watched: Any = None
         self._last_seen: tuple[Any, float] = None, 0.0  # in `health`: the newest image, and since when [s, steady]
         self._image_problem = ""
