@@ -201,6 +201,12 @@ def test_flats_of_another_setting_are_not_mixed(other: dict[str, float], text: s
     assert not (tmp_path / "flat.fits").exists()
 
 
+def test_a_decimal_comma_is_not_the_end_of_an_angle(tmp_path: Path) -> None:
+    table = tmp_path / "flats.csv"
+    table.write_text("file, reference, part, degrees\nturned.fits, A, B, 37,5\n")
+    assert "row 1 below the headings has more values than headings" in refused("flats", table, "--write", "f")
+
+
 def test_flats_that_leave_only_high_orders_open_bound_the_coefficients(tmp_path: Path) -> None:
     """Headings in columns, as an editor aligns them, are headings too."""
     y, x = (np.mgrid[:120, :120] - 59.5) / 60.0
@@ -222,3 +228,5 @@ def test_marks_in_millimetres_are_not_taken_for_metres(tmp_path: Path) -> None:
     rows = [f"{column},{row},{column * millimetres},{row * millimetres}" for column, row in places]
     table.write_text("\n".join(["column,row,x,y", *rows]))
     assert "x and y must be in m" in refused("grid", table, surface)
+    unknown = save(tmp_path / "other.fits", np.zeros((PIXELS, PIXELS)), pitch=None)
+    assert "m per pixel: x and y must be in m" in refused("grid", table, unknown)

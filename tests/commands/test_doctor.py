@@ -187,6 +187,7 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("virtual_bench", LINK | {"framed.word_bits": 8}, "framed.word_bits"),
     ("virtual_bench", LINK | {"framed.scale": 0}, "framed.scale = 0"),
     ("virtual_bench", {"mirror.principle": "membrane", "membrane.pitch": 0.01}, "membrane"),
+    ("virtual_bench", {"mirror.principle": "membrane", "membrane.tension": 1.0}, "membrane.tension = 1 N/m"),
     ("virtual_bench", {"electronics.amplifier_min": 500.0}, "electronics.amplifier_min = 500 V"),
     ("virtual_bench", {"piezo.creep_fastest": 10.0, "piezo.creep_slowest": 5.0}, "piezo.creep_slowest, 5 s"),
     ("virtual_bench", LINK | {"framed.channels": 41}, "framed.channels = 41"),

@@ -39,6 +39,17 @@ def test_nothing_is_found_when_all_agrees(length: float) -> None:
     assert (result.place == np.arange(37)).all()
 
 
+@pytest.mark.parametrize("length", [1.5e-3, 2.0e-3, 2.6e-3, 3.5e-3])
+def test_a_sensor_that_sees_the_terms_alone_finds_nothing_else(length: float) -> None:
+    order = np.arange(37)
+    order[[2, 6]] = order[[6, 2]]
+    terms, root = PLANT.modes, np.sqrt(PLANT.points.weight)[:, None]
+    seen = terms @ np.linalg.lstsq(root * terms, root * response(*stand(-0.82), length), rcond=None)[0]
+    result = check(seen[:, order])
+    assert result.registration is not None and result.registration.turn == pytest.approx(-0.82, abs=0.01)
+    assert len(result.findings) == 2 and result.findings[-1] == "actuators 3 and 7 are exchanged"
+
+
 def test_exchanged_pair() -> None:
     order = np.arange(37)
     order[[2, 6]] = order[[6, 2]]

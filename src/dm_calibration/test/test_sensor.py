@@ -61,6 +61,14 @@ def test_a_smaller_aperture_of_the_mirror_is_cut_out() -> None:
     assert found.radius == pytest.approx(0.8 * RADIUS)
 
 
+@pytest.mark.parametrize("radius", [0.0, 0.9 * RADIUS])
+def test_an_aperture_that_the_sensor_does_not_see_is_refused(radius: float) -> None:
+    small = message()
+    small.radius = radius
+    with pytest.raises(MapRejectedError, match=f"radius = {radius:g} m: must be at least aperture.radius = {RADIUS:g}"):
+        read_sensor(sensor_map(small, "t"), Ingest(), IngestSettings(aperture_radius=RADIUS))
+
+
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
@@ -72,6 +80,7 @@ def test_a_smaller_aperture_of_the_mirror_is_cut_out() -> None:
         ({"convention": "zernike"}, "convention = 'zernike': must be one of born_wolf, noll, ansi, fringe"),
         ({"coefficients": [np.nan] * 21}, "must be finite"),
         ({"radius": np.inf}, "must be finite"),
+        ({"coefficients": [0.3] * 21}, "coefficients up to 0.3 m: must be 0.001 m or less; in m?"),
     ],
 )
 def test_what_is_no_measurement_is_refused(fields: dict[str, Any], text: str) -> None:

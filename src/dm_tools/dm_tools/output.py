@@ -37,7 +37,7 @@ errors = Console(stderr=True, highlight=False, emoji=False)
 
 #: The value of `--json` for standard output.
 STANDARD_OUTPUT = Path("-")
-#: The wavelength that coefficients are compared with on screens [m].
+#: Wavelength of the simulated interferometer, m.
 WAVELENGTH = 632.8e-9
 
 
@@ -171,5 +171,5 @@ def figures(message: Any, *names: str) -> dict[str, Any]:
 
 
 def as_wavelengths(length: float) -> str:
-    """A length (m) as a fraction of the interferometer's wavelength, such as λ/50; "" above λ/5."""
+    """A length (m) as a fraction of the simulated interferometer's wavelength, such as λ/50; "" above λ/5."""
     return in_wavelengths(length, WAVELENGTH)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dm_bringup.nodes import NAMES
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.figures import in_nanometres, told_from
-from dm_tools.output import NotRunningError, as_wavelengths, errors
+from dm_tools.output import NotRunningError, errors
 
 if TYPE_CHECKING:
     from dm_client import DeformableMirrorClient
@@ -68,9 +68,7 @@ def heard(client: DeformableMirrorClient, topic: str, timeout_s: float) -> Any:
 
 def promise(bound: float) -> str:
     """A 95 % bound on the largest coefficient error (m) as text, the same in all verbs."""
-    if not bound > 0.0:
-        return "not known"
-    return f"{in_nanometres(bound)} ({', '.join(filter(None, ('95 % bound', as_wavelengths(bound))))})"
+    return f"{in_nanometres(bound)} (95 % bound)" if bound > 0.0 else "not known"
 
 
 def promise_of(calibration: Any) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
+from dm_calibration.map_files.surface_map import PITCH_MAX
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, MapRejectedError, find_aperture
 from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
@@ -66,7 +67,7 @@ class IngestSettings:
         real(1e-9, 0.0, 1e-6, "m"), "Allowed deviation from wavelength.expected.", name="wavelength.tolerance"
     )
     pitch: float = live_parameter(
-        real(0.0, 0.0, 0.1, "m"),
+        real(0.0, 0.0, PITCH_MAX, "m"),
         "Lateral resolution per pixel, as found by `./dm measure --reference-sphere METRES`; files that state a value "
         "more than 5 % off are refused. 0 = as stated in the file.",
     )

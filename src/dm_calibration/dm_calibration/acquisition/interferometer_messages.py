@@ -9,6 +9,7 @@ from std_msgs.msg import Header
 
 from dm_calibration.acquisition.sensor import PIXELS, Seen, disc_terms
 from dm_calibration.map_files import SurfaceMap
+from dm_calibration.map_files.surface_map import HEIGHT_MAX
 from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.measurement import Measurement
 from dm_common.messages import OF_FILE, OF_FIT, doubles, taken
@@ -60,7 +61,7 @@ def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
     """The surface that a sensor measured, and the residual that its terms leave, m rms.
 
     Raises:
-        MapRejectedError: an unknown convention, too few terms, or values that are not finite.
+        MapRejectedError: an unknown convention, too few terms, or values that are not finite or of another unit.
     """
     radius, wavelength = message.radius, message.wavelength
     convention = message.convention or BORN_WOLF
@@ -72,6 +73,8 @@ def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
         raise MapRejectedError(f"{source}: {error}") from error
     if not np.isfinite([*coefficients, radius, wavelength]).all():
         raise MapRejectedError(f"{source}: coefficients, radius and wavelength: must be finite")
+    if (largest := float(np.abs(coefficients).max())) > HEIGHT_MAX:
+        raise MapRejectedError(f"{source}: coefficients up to {largest:g} m: must be {HEIGHT_MAX:g} m or less; in m?")
     pitch = 2.0 * radius / PIXELS if radius > 0.0 else None
     surface = SurfaceMap(disc_terms() @ coefficients, wavelength, pitch, "zernike", instrument=source)
     return surface, message.residual_rms

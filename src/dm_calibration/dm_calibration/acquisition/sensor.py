@@ -10,6 +10,7 @@ import numpy as np
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
@@ -17,6 +18,8 @@ from dm_common.optics.zernike import basis
 
 #: Width and height, in pixels, of the map that is drawn from coefficients.
 PIXELS = 256
+#: Relative difference of radii that is rounding.
+SAME_RADIUS = 1e-6
 
 #: A surface, and the residual that the sensor reports, m rms.
 Seen = tuple[SurfaceMap, float]
@@ -34,12 +37,16 @@ def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[S
     """Map and measurement from what a sensor saw: over the configured aperture, else over that of the sensor.
 
     Raises:
+        MapRejectedError: the aperture is larger than the sensor's.
         MapRejectedError, InsufficientDataError: see :class:`Ingest`.
     """
     surface, residual_rms = seen
     settings = replace(settings, pitch=0.0)  # the parameter applies to a camera only
-    if not settings.aperture_radius and surface.pitch:
-        settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
+    radius, wanted = 0.5 * PIXELS * (surface.pitch or 0.0), settings.aperture_radius
+    if wanted > radius * (1.0 + SAME_RADIUS):
+        raise MapRejectedError(f"radius = {radius:g} m: must be at least aperture.radius = {wanted:g} m, and not 0")
+    if not wanted and radius:
+        settings = replace(settings, aperture_radius=radius, aperture_centre=(0.0, 0.0))
     surface, measured = ingest.measure(surface, settings)
     sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exact, also between pixels
     unknown = np.full_like(measured.coefficients, np.nan)

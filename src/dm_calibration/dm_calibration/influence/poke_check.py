@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from dm_calibration.influence.registration import Registration, bumps, register, unit_responses
+from dm_calibration.influence.registration import Registration, bumps, only_terms, register, unit_responses
 from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch, rings
 from dm_common.optics.sampling import SamplePoints
@@ -109,6 +109,7 @@ def check_pokes(
             else f"{active.size} actuators were moved: wiring and orientation can be checked from {ANSWERS_MIN} on"
         )
         return replace(nothing, findings=(problem, *findings))
+    terms = only_terms(unit[active], points)
     single, double = active, {}
     for _ in range(2):  # again without those that move two places, which would distort it
         stands = register(unit[single], single, points, x, y, radius)
@@ -119,7 +120,7 @@ def check_pokes(
             )
             return replace(nothing, findings=(*findings, problem))
         registration = stands
-        expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
+        expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points, terms)
         height = np.maximum(height, np.finfo(float).tiny)
         table = np.zeros((count, count))
         table[active] = (unit[active] * points.weight) @ expected.T

@@ -20,6 +20,7 @@ from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import basis
 
 #: Places in the plane as complex numbers, x + iy.
 Places = NDArray[np.complex128]
@@ -54,7 +55,11 @@ INNER = 0.72
 INNER_MIN = 6
 #: Relative errors of scale and shift due to bumps of another shape than expected.
 SCALE_BIAS = 0.005
+#: The same of scale where only terms are seen, which may have been fitted over a larger aperture.
+SCALE_BIAS_OF_TERMS = 0.02
 SHIFT_BIAS = 0.02
+#: Rms share of the responses beyond the Zernike terms below which there are only these.
+ONLY_TERMS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -107,10 +112,28 @@ def _seen(similarity: _Similarity, places: Places) -> Places:
     return similarity.factor * (-places.conj() if similarity.mirrored else places) + similarity.shift
 
 
-def bumps(places: Places, width: float, points: SamplePoints) -> tuple[Floats, Floats]:
-    """Bumps of unit height at `places` (N,), in radii of the aperture as is `width`: see :func:`unit_responses`."""
+def bumps(places: Places, width: float, points: SamplePoints, terms: Floats | None = None) -> tuple[Floats, Floats]:
+    """Bumps of unit height at `places` (N,), in radii of the aperture as is `width`: see :func:`unit_responses`.
+
+    Args:
+        terms: (P, K) all that the sensor shows of a surface; None = everything.
+    """
     distance = np.abs(places[:, None] - (points.x + 1j * points.y))
-    return unit_responses(np.exp(-0.5 * np.square(distance / width)), points)
+    sag = np.exp(-0.5 * np.square(distance / width))
+    return unit_responses(sag if terms is None else _within(sag, points, terms), points)
+
+
+def _within(sag: Floats, points: SamplePoints, terms: Floats) -> Floats:
+    """The part of `sag` (N, P) that consists of `terms`."""
+    root = np.sqrt(points.weight)[:, None]
+    return np.asarray((terms @ np.linalg.lstsq(root * terms, root * sag.T, rcond=None)[0]).T)
+
+
+def only_terms(unit: Floats, points: SamplePoints) -> Floats | None:
+    """(P, 21) Zernike terms if the responses (A, P) hold nothing else, as those of a sensor do; None = they do."""
+    terms = basis(points.x, points.y)
+    left = rms(unit - _within(unit, points, terms), points.weight)
+    return terms if np.max(left) < ONLY_TERMS else None
 
 
 def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
@@ -135,20 +158,21 @@ def register(
     """
     places: Places = np.asarray((x + 1j * y) / radius, dtype=np.complex128)
     step = pitch(places.real, places.imag)
-    seen, width = _located(unit, points, step)
+    terms = only_terms(unit, points)
+    seen, width = _located(unit, points, step, terms)
     if np.unique((np.abs(seen[:, None] - seen) < TOGETHER * step).argmax(axis=1)).size < PLACES_MIN:
         return None
     match = _matched(seen, active, places, step)
-    return _refined(match, unit, points, places, width, radius)
+    return _refined(match, unit, points, places, width, radius, terms)
 
 
-def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, float]:
+def _located(unit: Floats, points: SamplePoints, step: float, terms: Floats | None) -> tuple[Places, float]:
     """Where each response (A, P) looks most like a bump, and the width that fits best in all."""
     spacing = max(step * GRID, FINEST)
     line = np.arange(-REACH, REACH + spacing, spacing)
     grid = (line[:, None] + 1j * line).ravel()
     grid = grid[np.abs(grid) <= REACH]
-    tables = [np.abs((unit * points.weight) @ bumps(grid, width * step, points)[0].T) for width in WIDTHS]
+    tables = [np.abs((unit * points.weight) @ bumps(grid, width * step, points, terms)[0].T) for width in WIDTHS]
     best = int(np.argmax([table.max(axis=1).mean() for table in tables]))
     return grid[tables[best].argmax(axis=1)], WIDTHS[best] * step
 
@@ -208,7 +232,7 @@ def _closest(seen: Places, places: Places, start: _Similarity, step: float) -> _
 
 
 def _refined(
-    match: _Match, unit: Floats, points: SamplePoints, places: Places, width: float, radius: float
+    match: _Match, unit: Floats, points: SamplePoints, places: Places, width: float, radius: float, terms: Floats | None
 ) -> Registration:
     """Fit similarity and width to the maps of actuators that are well inside both aperture and arrangement."""
     away = np.abs(places - places.mean())[match.place]
@@ -222,7 +246,7 @@ def _refined(
     def residual(values: Floats, chosen: Bools) -> Floats:
         factor = np.exp(values[0] + 1j * values[1])
         similarity = _Similarity(factor, complex(values[2], values[3]), mirrored)
-        expected, _ = bumps(_seen(similarity, places[match.place[chosen]]), np.exp(values[4]), points)
+        expected, _ = bumps(_seen(similarity, places[match.place[chosen]]), np.exp(values[4]), points, terms)
         measured = unit[chosen]
         share = (measured * expected) @ points.weight  # the expected bumps are of unit rms
         return np.asarray(root * (measured - share[:, None] * expected))
@@ -245,7 +269,7 @@ def _refined(
         scale=scale,
         turn_sigma=float(sigma[1]),
         shift_sigma=float(np.hypot(max(sigma[2], sigma[3]) * radius, SHIFT_BIAS * np.hypot(*metres))),
-        scale_sigma=float(np.hypot(sigma[0], SCALE_BIAS) * scale),
+        scale_sigma=float(np.hypot(sigma[0], SCALE_BIAS if terms is None else SCALE_BIAS_OF_TERMS) * scale),
         width=float(np.exp(values[4]) * radius),
     )
 

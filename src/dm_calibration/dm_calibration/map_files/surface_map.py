@@ -27,8 +27,8 @@ MAX_PIXELS = 2**25
 #: Units of length used in files, as m.
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 
-#: Largest height of a map, m: far beyond the range of any interferometer.
-HEIGHT_MAX = 10.0
+#: Largest height of a map, or coefficient of a sensor, m: beyond the range of any instrument, so of another unit.
+HEIGHT_MAX = 1e-3
 
 #: Largest relative difference between the pitches along x and y for which pixels count as square.
 SQUARE_TOLERANCE = 0.01
@@ -37,7 +37,7 @@ SQUARE_TOLERANCE = 0.01
 PITCH_TOLERANCE = 1e-4
 
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
-_PITCH_RANGE = (1e-9, 0.1)  # m per pixel
+PITCH_MIN, PITCH_MAX = 1e-9, 1e-3  # m per pixel
 
 
 class MapFileError(CodedError):
@@ -156,11 +156,11 @@ def check_factor(name: str, value: float) -> float:
 
 def check_pitch(pitch: float) -> float | None:
     """Return the pitch [m per pixel], None for 0 (unknown), or raise MapFileError."""
-    low, high = _PITCH_RANGE
     if pitch == 0:
         return None
-    if not low <= pitch <= high:
-        raise _outside("lateral resolution", f"{pitch:g} m per pixel", f"0 (unknown) or {low:g} to {high:g} m")
+    if not PITCH_MIN <= pitch <= PITCH_MAX:
+        allowed = f"0 (unknown) or {PITCH_MIN:g} to {PITCH_MAX:g} m"
+        raise _outside("lateral resolution", f"{pitch:g} m per pixel", allowed)
     return pitch
 
 

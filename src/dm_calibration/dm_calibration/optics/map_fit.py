@@ -109,7 +109,8 @@ class MapFitter:
         self.valid_fraction = self.valid_pixels / max(self.aperture.pixels(), 1)
         if self.valid_pixels < len(TERMS):
             raise InsufficientDataError(
-                f"{self.valid_pixels} valid pixels inside the aperture: {len(TERMS)} terms need at least {len(TERMS)}"
+                f"{self.valid_pixels} valid pixels inside the aperture (radius {radius_px:.3g} pixels): "
+                f"{len(TERMS)} terms need at least {len(TERMS)}"
             )
         x = (np.arange(mask.shape[1])[self._columns] - centre_x_px) / radius_px
         y = (centre_y_px - np.arange(mask.shape[0])[self._rows]) / radius_px

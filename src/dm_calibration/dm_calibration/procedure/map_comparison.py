@@ -73,9 +73,9 @@ def _other_setup(measured: Measurement, setup: Setup) -> str:
             "flip_x {}, flip_y {}, rotate_deg {:g}".format(*each) for each in (measured.orientation, setup.orientation)
         )
         return f"orientation {here}, before it was {before}: leave the interferometer's orientation.* alone in a run"
-    if measured.system_error_subtracted != setup.system_error_subtracted:
-        return "system error subtracted differs from the maps before: never mix them"
     if measured.reference_surface != setup.reference_surface:
         here, before = (each or "none" for each in (measured.reference_surface, setup.reference_surface))
         return f"reference_surface {here}, before it was {before}: leave it alone in a run"
+    if measured.system_error_subtracted != setup.system_error_subtracted:
+        return "system error subtracted differs from the maps before: never mix them"
     return ""

@@ -238,16 +238,16 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
             f"{calibration.wavelength * 1e9:.3f} nm (0 = not known)"
         )
+    if measured.reference_surface != calibration.reference_surface:
+        raise MapNotUsableError(
+            f"reference_surface {measured.reference_surface or 'none'}, the calibration was made with "
+            f"{calibration.reference_surface or 'none'}"
+        )
     subtracted = measured.system_error_subtracted, calibration.system_error_subtracted
     if -1 not in subtracted and subtracted[0] != subtracted[1]:
         raise MapNotUsableError(
             f"system_error_subtracted = {subtracted[0]}, in the calibration's maps {subtracted[1]} (1 = the instrument "
             "had subtracted its own error): set the instrument as it was"
-        )
-    if measured.reference_surface != calibration.reference_surface:
-        raise MapNotUsableError(
-            f"reference_surface {measured.reference_surface or 'none'}, the calibration was made with "
-            f"{calibration.reference_surface or 'none'}"
         )
     radius, tolerance = calibration.aperture_radius, options.aperture_tolerance
     if measured.radius and not abs(measured.radius - radius) <= tolerance * radius:

@@ -106,11 +106,12 @@ def certificate(
         within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
         usual = f"largest coefficient error within {within} for half the spheres in the range"
         foretold = f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends"
+    promise = f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach),
-        ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"),
+        ("promise", f"{promise} and what creep may add that no map has shown: each move states its own bound"),
         ("predicted", foretold),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),

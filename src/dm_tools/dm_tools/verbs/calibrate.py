@@ -130,10 +130,15 @@ def show_result(result: Any, calibration: Any = None) -> None:
         console.print("poke check: wiring and orientation are as configured")
 
 
-def after_run(result: Any, written: Path | None) -> str:
-    """What to do next, with the parameters that were found `written` to a file or not; "" = nothing to advise."""
+def after_run(result: Any, written: Path | None, used: bool = True) -> str:
+    """What to do next, with the parameters that were found `written` to a file or not; "" = nothing to advise.
+
+    `used`: whether the calibration is in use now.
+    """
     if result.parameters:  # they correct which actuators are neighbours for the limits, and where the aperture is
         return f"start the nodes with {written or 'these parameters'}, and calibrate again"
+    if result.id and not used:
+        return f"the service load_calibration with id: {result.id} puts it into use"
     return "./dm focus 0.02" if result.id else "./dm calibrate" if result.poke_check_passed else ""
 
 
@@ -281,5 +286,5 @@ def calibrate(
     write_json(json, {"calibration": figures_of(result)})
     if dry_run:
         next_step("the same without --dry-run measures")
-    elif then := after_run(result, write):
+    elif then := after_run(result, write, activate):
         next_step(then, namespace)

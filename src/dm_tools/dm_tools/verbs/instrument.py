@@ -18,6 +18,8 @@ from dm_tools.parameter_changes import keep_before
 
 #: Columns of tables that hold no numbers.
 _TEXTS = ("file", "reference", "part")
+#: Where values without a heading go.
+_SURPLUS = "..."
 
 
 class Procedure(StrEnum):
@@ -130,10 +132,13 @@ def _retrace(maps: list[Any]) -> dict[str, Any]:
 
 def _grid(table: Path, surface: Any) -> dict[str, Any]:
     from dm_calibration.acquisition.ingest import ZOOM_SHARE
+    from dm_calibration.map_files.surface_map import PITCH_MAX, PITCH_MIN
     from dm_calibration.optics.instrument import lateral_scale
 
     marks = [[float(value) for value in row] for row in _table(table, "column", "row", "x", "y")]
     found = lateral_scale(marks, surface.sag.shape)
+    if not PITCH_MIN <= found.pitch <= PITCH_MAX:
+        raise ValueError(f"{table}: the marks give {found.pitch:g} m per pixel: x and y must be in m")
     if surface.pitch and abs(surface.pitch - found.pitch) > ZOOM_SHARE * found.pitch:  # the node would refuse every map
         raise ValueError(
             f"{table}: the marks give {found.pitch * 1e6:.3f} um per pixel, the map tells {surface.pitch * 1e6:.3f}: "
@@ -161,7 +166,7 @@ def _table(path: Path, *names: str) -> list[list[str]]:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
             rows = [
                 {(name or "").strip(): value for name, value in row.items()}
-                for row in csv.DictReader(file, restval="", skipinitialspace=True)
+                for row in csv.DictReader(file, restval="", restkey=_SURPLUS, skipinitialspace=True)
             ]
     except (csv.Error, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: must be a table, CSV in UTF-8: {error}") from error
@@ -171,6 +176,10 @@ def _table(path: Path, *names: str) -> list[list[str]]:
     default = {"degrees": "0"}
     table = [[row.get(name, "").strip() or default.get(name, "") for name in names] for row in rows]
     for number, values in enumerate(table, start=1):
+        if any(value.strip() for value in rows[number - 1].get(_SURPLUS, ())):
+            raise ValueError(
+                f"{path}: row {number} below the headings has more values than headings: numbers have a point, no comma"
+            )
         if "" in values:
             raise ValueError(f"{path}: row {number} below the headings has no {names[values.index('')]}")
         for name, value in zip(names, values, strict=True):

@@ -66,8 +66,8 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
         raise typer.BadParameter(f"--reference-sphere: {error}") from error
     differs = f", {pitch / info.pitch - 1.0:+.3%} against what is in use" if info.pitch > 0.0 else ""
     console.print(
-        f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it, "
-        "and the sphere's radius counts by half",
+        f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it. "
+        "Add half the relative error of the sphere's radius to scale_error",
         soft_wrap=True,
     )
     found = {"pitch": pitch}
