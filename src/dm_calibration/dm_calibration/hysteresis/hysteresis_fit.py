@@ -101,7 +101,8 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
         return ()
     more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
     return (
-        f"Hysteresis: {len(labels)} maps say nothing of the model or contradict it: {', '.join(labels[:5])}{more}.",
+        f"Hysteresis: left out {len(labels)} of {len(maps)} maps, for want of data or since they contradict the model: "
+        f"{', '.join(labels[:5])}{more}.",
     )
 
 
