@@ -224,13 +224,15 @@ def test_bad_maps_are_dropped_with_their_reason(mirror: Mirror) -> None:
 
 def test_maps_that_lack_a_part_are_left_out_unless_they_are_many(mirror: Mirror) -> None:
     maps = measure(LinearMirror(mirror.x, mirror.y, noise=1 * NM), mirror)
-    valid = np.full(len(maps), 0.99)
-    valid[[3, 7]] = 0.9, 0.97
-    reasons = reasons_of(fit_influence(replace(maps, valid_fraction=valid)), maps)
+    valid, sag = np.full(len(maps), 0.99), maps.sag.copy()
+    valid[[3, 5]] = 0.9  # map 5: pixels here and there
+    sag[3, maps.points.x > 0.9] = sag[7, np.hypot(maps.points.x, maps.points.y) > 0.99] = np.nan  # map 7: a thin rim
+    reasons = reasons_of(fit_influence(replace(maps, sag=sag, valid_fraction=valid)), maps)
     assert reasons.keys() == {maps.label[3]}
     assert "a part of the surface is missing: 90.0% of the aperture is valid" in reasons[maps.label[3]]
-    valid[: int(0.3 * len(maps))] = 0.9
-    assert not reasons_of(fit_influence(replace(maps, valid_fraction=valid)), maps)
+    many = slice(int(0.3 * len(maps)))
+    valid[many], sag[many] = 0.9, np.where(maps.points.x > 0.9, np.nan, maps.sag[many])
+    assert not reasons_of(fit_influence(replace(maps, sag=sag, valid_fraction=valid)), maps)
 
 
 @pytest.mark.parametrize("middle", [-1.0, 0.0, 3.0])

@@ -14,9 +14,10 @@ MAD_TO_SIGMA = 1.4826
 LEVERAGE_MAX = 0.95
 #: Largest share of sampling points without data.
 MISSING_POINTS_MAX = 0.2
-#: Share of the aperture by which a map may have fewer valid pixels than most: where a part is missing, what the mirror
-#: shows beyond the terms is taken for some of them (10 to 20 nm in random shapes, for a gap of a tenth). If more than
-#: the share GAPS_MAX of the maps have such gaps, they are all taken.
+#: Share of the pixels and of the sampling points by which a map may show less than most. Where a part is missing (not
+#: single pixels here and there, which cost no points), what the mirror shows beyond the terms is taken for some of
+#: them: 10 to 20 nm in random shapes, for a gap of a tenth. If more than the share GAPS_MAX of the maps have such gaps,
+#: they are all taken.
 GAP_MAX, GAPS_MAX = 0.03, 0.25
 #: No map with a smaller residual is an outlier, m rms.
 RESIDUAL_FLOOR = 5e-9
@@ -67,13 +68,13 @@ class FitOptions:
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
     """Reason for which each map cannot enter a fit; "" = it can."""
     reasons = []
-    usual = float(np.median(maps.valid_fraction))
-    gap = maps.valid_fraction < usual - GAP_MAX
+    usual, lacking = float(np.median(maps.valid_fraction)), np.isnan(maps.sag).mean(axis=1)
+    gap = (maps.valid_fraction < usual - GAP_MAX) & (lacking > np.median(lacking) + GAP_MAX)
     gap &= gap.mean() <= GAPS_MAX
-    for coefficients, applied, sag, valid, partial in zip(
-        maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, gap, strict=True
+    for coefficients, applied, sag, valid, missing, partial in zip(
+        maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, lacking, gap, strict=True
     ):
-        reason, missing = "", np.isnan(sag).mean()
+        reason = ""
         if not np.isfinite(coefficients).all():
             reason = "a Zernike coefficient is not finite"
         elif not np.isfinite(applied).all():
