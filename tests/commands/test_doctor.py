@@ -128,6 +128,7 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("interferometer", {"reference_surface": str(FLAT), "wavelength.expected": 532e-9}, "must be 532.000 nm"),
     ("interferometer", {"zernike_topic": "/wavefront/zernike"}, "must be empty beside it"),
     ("interferometer", {"retrace": [0.0]}, "retrace: 1 numbers, must be 36 or none"),
+    ("interferometer", {"aperture.radius": 0.0, "aperture.follow": True}, "counts only with aperture.radius"),
     ("interferometer", {"zernike_topic": "/zernike", **NO_FILES}, "is what this node itself publishes"),
     ("interferometer", {"zernike_topic": "wave front", **NO_FILES}, "zernike_topic = 'wave front'"),
     ("interferometer", {"trigger_output_suffix": "../x"}, "must be an ending such as .datx"),

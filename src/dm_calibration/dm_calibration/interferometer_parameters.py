@@ -68,6 +68,11 @@ def configure(
         raise ValueError(f"zernike_topic = {topic!r}: {', '.join(others)} must be empty beside it")
     if len(values["retrace"]) not in (0, RETRACE_SIZE):
         raise ValueError(f"retrace: {len(values['retrace'])} numbers, must be {RETRACE_SIZE} or none")
+    for name in ("aperture.follow", "aperture.centre_x", "aperture.centre_y"):
+        if values[name] and not values["aperture.radius"]:
+            raise ValueError(
+                f"{name} = {values[name]}: counts only with aperture.radius, which is 0: the aperture is what is seen"
+            )
     try:
         validate_topic_name(topic or "none")
     except InvalidTopicNameException as error:
