@@ -12,12 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 pytest_plugins = ("ros_fixtures",)
 
 # What is imported and collected stays to the end. Looked through for garbage again and again, as it grew and at the end
 # of each worker, it took two fifths of the processor time of collecting.
 gc.disable()
+
+# A busy machine makes examples slow, and no test is timed.
+settings.register_profile("suite", deadline=None)
+settings.load_profile("suite")
 
 #: Fixtures that start nodes or take a ROS domain.
 PROCESS_FIXTURES = {"domain", "observer", "start"}

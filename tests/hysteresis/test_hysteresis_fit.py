@@ -109,6 +109,16 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
 
 
+def test_maps_that_test_the_law_are_compared_with_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fit has not seen them, so that in a short run they are all far from it compared with the others."""
+    test = np.arange(60) >= 48
+    residual = np.where(test, 10.0, 1.0)[:, None] * np.where(np.arange(60) == 50, 9.0, 1.0)[:, None]
+    monkeypatch.setattr(hysteresis_fit, "identify", lambda *_, **__: SimpleNamespace(closest=residual))
+    run = Run(np.zeros((60, 1)), np.arange(60.0), Responses(np.zeros((60, 1)), 1, np.ones(60, dtype=bool)))
+    kept = hysteresis_fit._without_outliers(run, test, ())[1].responses.usable
+    assert np.flatnonzero(~kept).tolist() == [50]
+
+
 def test_a_map_that_contradicts_effective_signals_is_not_in_their_influence_function() -> None:
     """By less than hysteresis would explain, had the law not accounted for it."""
     maps, mirror = run(), SimulatedBench(SimulationConfig(seed=23, pixels=120)).mirror

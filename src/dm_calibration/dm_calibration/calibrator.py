@@ -17,6 +17,7 @@ from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
+from dm_calibration.influence.screening import LAW_ERRORS
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.store.calibration_store import new_id
 from dm_common import Floats
@@ -189,7 +190,9 @@ def fit_effective(
     """The influence function of `maps`, on effective signals if hysteresis is known; raises as `fit_influence`."""
     if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
-    followed = replace(options, hysteresis_allowance=0.0)  # effective signals do not miss their target
+    # Effective signals miss their target by no more than the law errs.
+    floor = max(options.residual_floor, LAW_ERRORS * hysteresis.held_out_max_zernike)
+    followed = replace(options, hysteresis_allowance=0.0, residual_floor=floor)
     fit = fit_influence(effective_maps(maps, hysteresis.law), followed, rings=mirror.rings, exclude=exclude)
     return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 

@@ -9,7 +9,7 @@ import pytest
 
 from dm_calibration.influence import quality
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import METHODS, TooFewMapsError, drift_columns, make_design
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_common.errors import UnknownNameError
@@ -227,6 +227,8 @@ def test_maps_that_lack_a_part_are_left_out_unless_they_are_many(mirror: Mirror)
     valid, sag = np.full(len(maps), 0.99), maps.sag.copy()
     valid[[3, 5]] = 0.9  # map 5: pixels here and there
     sag[3, maps.points.x > 0.9] = sag[7, np.hypot(maps.points.x, maps.points.y) > 0.99] = np.nan  # map 7: a thin rim
+    assert not reasons_of(fit_influence(replace(maps, sag=sag, valid_fraction=valid)), maps)  # nor of a run of pokes
+    maps = replace(maps, kind=(StepKind.EXCITATION,) * len(maps))
     reasons = reasons_of(fit_influence(replace(maps, sag=sag, valid_fraction=valid)), maps)
     assert reasons.keys() == {maps.label[3]}
     assert "a part of the surface is missing: 90.0% of the aperture is valid" in reasons[maps.label[3]]

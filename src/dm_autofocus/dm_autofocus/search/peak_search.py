@@ -84,7 +84,7 @@ class SearchConfig:
     def steps(self) -> int:
         """Number of measured positions of a search that shifts no sweep; each shift adds one sweep."""
         spacing = (self.high - self.low) / (self.coarse_points - 1)
-        sweeps = math.ceil(math.log(spacing / self.tolerance, (self.fine_points - 1) / 2))
+        sweeps = math.ceil(math.log(spacing / self.tolerance, (self.fine_points - 1) / 2) - 1e-9)
         return self.coarse_points + max(sweeps, 1) * self.fine_points
 
     def check_left(self) -> None:

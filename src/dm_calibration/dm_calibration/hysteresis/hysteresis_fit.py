@@ -88,8 +88,12 @@ def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) ->
     """Identify the law without outliers; in the run returned only the other maps are usable, all commands stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
-        good = agreeing(run.responses.usable, found.closest)
-        if good.sum() == run.responses.usable.sum():
+        # Apart from each other: fits mostly have not seen the test maps, which are then farther from all of them.
+        usable, good = run.responses.usable, np.zeros_like(test)
+        for kind in (usable & ~test, usable & test):
+            if kind.any():
+                good |= agreeing(kind, found.closest)
+        if good.sum() == usable.sum():
             return found, run
         run = replace(run, responses=replace(run.responses, usable=good))
     return identify(run, test, candidates), run

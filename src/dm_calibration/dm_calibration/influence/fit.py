@@ -176,7 +176,7 @@ class _Fitted(NamedTuple):
         rest = maps.applied[maps.reference].mean(axis=0) if maps.reference.any() else 0.0
         move = np.sqrt(np.square(maps.applied - rest) @ np.square(response))
         allowance = options.hysteresis_allowance * np.maximum.accumulate(move)
-        limit = np.maximum(np.maximum(median + options.outlier_sigmas * sigma, screening.RESIDUAL_FLOOR), allowance)
+        limit = np.maximum(max(median + options.outlier_sigmas * sigma, options.residual_floor), allowance)
         outside = scaled > limit
         if not outside.any():
             return None

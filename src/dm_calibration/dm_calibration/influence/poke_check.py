@@ -112,7 +112,7 @@ def check_pokes(
     terms = only_terms(unit[active], points)
     single, double = active, {}
     for _ in range(2):  # again without those that move two places, which would distort it
-        stands = register(unit[single], single, points, x, y, radius)
+        stands = register(unit[single], single, points, x, y, radius, terms)
         if stands is None:
             problem = (
                 "all channels move the same one or two places: check the wiring, mirror.pitch (or mirror.actuator_x "

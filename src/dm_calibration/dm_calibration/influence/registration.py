@@ -144,7 +144,7 @@ def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
 
 
 def register(
-    unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float
+    unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float, terms: Floats | None
 ) -> Registration | None:
     """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
     all of them lie over one place or two.
@@ -155,10 +155,10 @@ def register(
         points: the sampling points, of the unit disc.
         x, y: (N,) configured positions, m.
         radius: of the aperture, m.
+        terms: all that is seen of a surface, see :func:`only_terms`.
     """
     places: Places = np.asarray((x + 1j * y) / radius, dtype=np.complex128)
     step = pitch(places.real, places.imag)
-    terms = only_terms(unit, points)
     seen, width = _located(unit, points, step, terms)
     if np.unique((np.abs(seen[:, None] - seen) < TOGETHER * step).argmax(axis=1)).size < PLACES_MIN:
         return None

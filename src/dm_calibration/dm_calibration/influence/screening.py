@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.weights import check_epsilon
 from dm_common.values import live_parameter, real
 
@@ -17,10 +17,11 @@ MISSING_POINTS_MAX = 0.2
 #: Share of the pixels and of the sampling points by which a map may show less than most. Where a part is missing (not
 #: single pixels here and there, which cost no points), what the mirror shows beyond the terms is taken for some of
 #: them: 10 to 20 nm in random shapes, for a gap of a tenth. If more than the share GAPS_MAX of the maps have such gaps,
-#: they are all taken.
+#: they are all taken; so are all of a run of pokes, a few of which show all there is of an actuator.
 GAP_MAX, GAPS_MAX = 0.03, 0.25
-#: No map with a smaller residual is an outlier, m rms.
-RESIDUAL_FLOOR = 5e-9
+#: No map with a smaller residual is an outlier, m rms; with a hysteresis law, nor below LAW_ERRORS times the 95 % bound
+#: of the law's error of a coefficient.
+RESIDUAL_FLOOR, LAW_ERRORS = 5e-9, 2.0
 #: Largest share of the maps that may be dropped as outliers.
 DROPPED_MAX = 0.25
 
@@ -32,6 +33,7 @@ class FitOptions:
     Attributes:
         method: a name of METHODS.
         epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+        residual_floor: m rms, no map with a smaller residual is an outlier.
 
     Raises:
         ValueError: fewer than 2 folds, or an epsilon that is not above 0.
@@ -40,6 +42,7 @@ class FitOptions:
     method: str = "AZreg"
     folds: int = 10
     epsilon: float | None = None
+    residual_floor: float = RESIDUAL_FLOOR
     valid_fraction_min: float = live_parameter(
         real(0.5, 0.0, 1.0), "Smallest share of valid pixels in the aperture for a map to be fitted, from any source."
     )
@@ -49,8 +52,8 @@ class FitOptions:
     hysteresis_allowance: float = live_parameter(
         real(0.10, 0.0, 1.0),
         "Share of its moves by which an actuator may miss its target through hysteresis (half the loop, whose width is "
-        "7-15 % of the move) without the map being an outlier. 0 = no hysteresis: without a hysteresis law, the error "
-        "promised for moves is then that of held-out maps.",
+        "7-15 % of the move) without the map being an outlier, where no hysteresis law is followed. 0 = no hysteresis: "
+        "the error promised for moves is then that of held-out maps.",
     )
     dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead if the response is below this many standard errors.")
     weak_sigmas: float = live_parameter(
@@ -68,9 +71,12 @@ class FitOptions:
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
     """Reason for which each map cannot enter a fit; "" = it can."""
     reasons = []
-    usual, lacking = float(np.median(maps.valid_fraction)), np.isnan(maps.sag).mean(axis=1)
-    gap = (maps.valid_fraction < usual - GAP_MAX) & (lacking > np.median(lacking) + GAP_MAX)
-    gap &= gap.mean() <= GAPS_MAX
+    seen, lacking = np.isfinite(maps.coefficients).all(axis=1), np.isnan(maps.sag).mean(axis=1)
+    usual, gap = 0.0, np.zeros_like(seen)
+    if seen.any() and StepKind.EXCITATION in maps.kind:
+        usual = float(np.median(maps.valid_fraction[seen]))
+        gap = seen & (maps.valid_fraction < usual - GAP_MAX) & (lacking > np.median(lacking[seen]) + GAP_MAX)
+        gap &= gap.sum() <= GAPS_MAX * seen.sum()
     for coefficients, applied, sag, valid, missing, partial in zip(
         maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, lacking, gap, strict=True
     ):

@@ -37,7 +37,7 @@ SQUARE_TOLERANCE = 0.01
 PITCH_TOLERANCE = 1e-4
 
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
-PITCH_MIN, PITCH_MAX = 1e-9, 1e-3  # m per pixel
+PITCH_MIN, PITCH_MAX = 1e-9, 1e-2  # m per pixel
 
 
 class MapFileError(CodedError):
