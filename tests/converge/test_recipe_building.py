@@ -13,6 +13,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import Recipe, RecipeError
+from dm_controller.converge.defects import agreeing_maps
 from dm_controller.converge.recipe_building import (
     BuildOptions,
     BuildStep,
@@ -22,7 +23,7 @@ from dm_controller.converge.recipe_building import (
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError, recipe_targets
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import FocusTarget, Shape
 from linear_mirror import hexagon
 from linear_plant import LIMITS, MODEL, LinearPlant
 from studies.comparison.compare import true_error
@@ -235,3 +236,12 @@ def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
     with pytest.raises(UnreachableError, match=r"actuator \d+ stands at its limit"):
         RecipeBuilder(weaker, plant, lambda: plant.time).build(FocusTarget(0.02))
     assert "measure" not in plant.calls
+
+
+def test_a_map_of_another_surface_does_not_count_in_a_round() -> None:
+    rng = np.random.default_rng(3)
+    maps = [Shape(5e-10 * rng.standard_normal(21), np.zeros(4)) for _ in range(6)]
+    assert agreeing_maps(maps) == maps
+    wrong = Shape(3e-8 * rng.standard_normal(21), np.zeros(4))
+    assert agreeing_maps([*maps[:3], wrong, *maps[3:]]) == maps
+    assert len(agreeing_maps([*maps[:2], wrong])) == 3, "two say nothing against one"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.excitation import excitation
-from dm_calibration.hysteresis.hysteresis_fit import _remarks, _without_outliers
+from dm_calibration.hysteresis.hysteresis_fit import _few_maps, _remarks, _without_outliers
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.responses import Responses
@@ -114,6 +114,12 @@ def test_maps_too_few_to_tell_the_loops_apart_are_said_to_be() -> None:
     run, check = relay_run(0.0, 12, 60)
     found = identify(run, check, LAWS)
     assert not found.fit.candidate.own and says_alike(found)
+
+
+def test_from_few_maps_more_is_expected_than_held_out_moves_show() -> None:
+    run, check = relay_run(0.2, 11, 60)
+    assert _few_maps(identify(run, check, LAWS), run) == pytest.approx((75 / 53) ** 4)
+    assert _few_maps(identify(run, check, COMMON), run) == 1.0
 
 
 def test_laws_span_the_same_in_a_full_cycle() -> None:

@@ -17,6 +17,9 @@ from dm_controller.solvers.base import Shape
 
 #: Lower bound of the standard deviation of a mean of maps, m.
 SIGMA_MIN = 1e-12
+#: Maps of a round that are farther from their median than FAR median distances, and than FAR_MIN (m), do not count,
+#: from FEW maps on: a door slammed, or the map shows an earlier surface.
+FAR, FAR_MIN, FEW = 4.0, 2e-9, 4
 
 
 def mean_of(shapes: Sequence[Shape]) -> Shape:
@@ -24,6 +27,14 @@ def mean_of(shapes: Sequence[Shape]) -> Shape:
     return Shape(
         np.mean([shape.coefficients for shape in shapes], axis=0), np.mean([shape.sag for shape in shapes], axis=0)
     )
+
+
+def agreeing_maps(maps: Sequence[Shape]) -> list[Shape]:
+    """The maps of one round without outliers."""
+    coefficients = np.array([shape.coefficients[PISTON_TILT:] for shape in maps])
+    away = np.linalg.norm(coefficients - np.median(coefficients, axis=0), axis=1)
+    limit = max(FAR * float(np.median(away)), FAR_MIN)
+    return [shape for shape, distance in zip(maps, away, strict=True) if distance <= limit or len(maps) < FEW]
 
 
 class Defects:

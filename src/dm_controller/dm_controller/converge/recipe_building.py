@@ -18,7 +18,7 @@ from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Bench
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
-from dm_controller.converge.defects import Defects, mean_of
+from dm_controller.converge.defects import Defects, agreeing_maps, mean_of
 from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError, target_of
@@ -220,14 +220,15 @@ class RecipeBuilder:
             # The time of the map by its stamp, limited to the time between the last state and now.
             seen = min(max(1e-9 * measured.stamp_ns, self.state.time), self._now())
             defects.append(surface - self._predicted(law.effective(law.advance(self.state, seen))))
-            taken = _Round(target, signals, aim, mean_of(defects), number)
+            agreeing = agreeing_maps(defects)
+            taken = _Round(target, signals, aim, mean_of(agreeing), number)
             error = self._error(taken)
             maps, built = before + number, len(self._built)
             self._on_step(BuildStep(target.curvature, maps, built, error.max_zernike, rms_sag(error, model)))
-            sure = number >= MAPS_MIN and self._defects.spread(defects) <= SURE_SHARE * options.tolerance
+            sure = number >= MAPS_MIN and self._defects.spread(agreeing) <= SURE_SHARE * options.tolerance
             if sure or number == options.average:
                 break
-        self._defects.add(aim, defects)
+        self._defects.add(aim, agreeing)
         self.state = law.advance(self.state, self._now())
         return taken
 
