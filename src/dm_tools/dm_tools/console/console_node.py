@@ -27,6 +27,7 @@ from dm_tools.long_actions import LONG, ExternalGoals
 from dm_tools.running_suite import NEEDED
 
 TOPICS = client.TOPICS | {
+    "actuator_estimate": (ActuatorEstimate, qos.LATCHED),
     "recipes": (RecipeBook, qos.LATCHED),
     "surface_map": (Image, qos.MAP),
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
@@ -66,6 +67,7 @@ class Snapshot:
     recipes: Any = None
     capabilities: Any = None
     actuator_state: Any = None
+    actuator_estimate: Any = None
     surface_map: Any = None
     surface_map_info: Any = None
     zernike: Any = None
@@ -94,13 +96,14 @@ class ConsoleNode:
         # Transient local: nodes repeat their latest lines to late subscribers.
         profile = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(Log, "/rosout", self._take_line, profile)
-        self.node.create_subscription(ActuatorEstimate, "actuator_estimate", self.observer.take, qos.LATCHED)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         self.watched = {name: ExternalGoals(self.node, client.INTERFACES[name], name) for name in LONG}
 
     def _take(self, topic: str, message: Any) -> None:
         if topic == "actuator_state":
             self.observer.observe(message)
+        elif topic == "actuator_estimate":
+            self.observer.take(message)
         elif topic == "calibration":
             self.observer.use(message)
 
