@@ -26,6 +26,9 @@ METADATA_FILE, SUFFIX = "metadata.yaml", ".mcap"
 MAGIC = b"\x89MCAP0\r\n"
 #: Topic on which nodes publish their parameters.
 PARAMETER_EVENTS = "/parameter_events"
+#: Recorded messages reach the disk with the first message that is later by more than this, ns, or by
+#: `BagWriter.flush`; the rest is lost when the recorder is killed or loses its power.
+FLUSH_NS = 4 * 10**9
 #: The library writes no checksums of its own; those of zstd are verified by every decompressor.
 CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
 
@@ -80,7 +83,7 @@ class BagWriter:
         self._storage = self._writer.storage
         self._storage.compressor = partial(zstd.compress, options=CHECKED)
         self._connections: dict[str, interfaces.Connection] = {}
-        self.flush()
+        self._flushed = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -96,9 +99,12 @@ class BagWriter:
     def write(self, name: str, data: bytes, log_time: int) -> None:
         """Write one message of the topic `name`, announced before; the time in ns."""
         self._writer.write(self._connections[name], log_time, data)
+        if abs(log_time - self._flushed) > FLUSH_NS:
+            self.flush()
+            self._flushed = log_time
 
     def flush(self) -> None:
-        """Bring to the disk what was written; the rest is lost when the process is killed or loses its power."""
+        """Bring to the disk what was written."""
         if self._storage.chunk.msgs:
             self._storage.close_chunk()
         self._storage.bio.flush()

@@ -28,8 +28,8 @@ DISCOVERY_PERIOD_S = 0.25
 ASK_AGAIN_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
-#: How often what was written is brought to the disk, s.
-FLUSH_S = 3.0
+#: The writer flushes after this time without a message, s; with `FLUSH_NS` no message waits longer than five seconds.
+IDLE_S = 1.0
 #: Topic of the maps themselves, several megabytes each; the results of their fits are on other topics.
 MAP_TOPIC = "surface_map"
 
@@ -82,7 +82,6 @@ class Recorder:
         self._asked: dict[bytes, float] = {}
         self._seen: dict[bytes, int] = {}
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
-        self._node.create_timer(FLUSH_S, lambda: self._jobs.put(self._bag.flush))
 
     def _now_ns(self) -> int:
         return self._since_ns + time.monotonic_ns()
@@ -190,7 +189,13 @@ class Recorder:
 
     def _write(self) -> None:
         """Write what arrives; compression must not hold up the executor."""
-        while (job := self._jobs.get()) is not None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=IDLE_S)
+            except queue.Empty:
+                job = self._bag.flush
+            if job is None:
+                return
             if self._failure is None:
                 try:
                     job()
