@@ -122,6 +122,7 @@ class Asker(Connection):
         self._publishers = {name: self.node.create_publisher(CASES[name][0], name, qos.COMMAND) for name in ANSWERED_ON}
         self._log: list[Log] = []
         self.node.create_subscription(Log, "/rosout", self._log.append, 1000)
+        self.start()
 
     def ask(self, name: str, values: str, names: Mapping[str, str]) -> Answer:
         """Try one case."""

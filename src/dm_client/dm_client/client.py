@@ -103,6 +103,7 @@ class DeformableMirrorClient(Connection):
 
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
         super().__init__("dm_client", namespace, domain, TOPICS, self.watched, timeout_s=timeout_s)
+        self.start()
 
     def __enter__(self) -> Self:
         return self

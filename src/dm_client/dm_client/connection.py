@@ -80,7 +80,7 @@ def full_namespace(namespace: str) -> str:
 
 
 class Connection:
-    """A node that receives topics and calls the nodes of one mirror.
+    """A node that receives topics and calls the nodes of one mirror, once it is started.
 
     Args:
         name: of the node; process id and a number are appended.
@@ -133,6 +133,9 @@ class Connection:
             for interface_name, interface in served.items():
                 make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
                 self.clients[interface_name] = make(self.node, interface, interface_name)
+
+    def start(self) -> None:
+        """Begin to receive messages; subscriptions made before miss nothing."""
         self._background = BackgroundExecutor(self.node)
         atexit.register(self.close)  # the interpreter would abort if the thread still ran
 

@@ -98,6 +98,7 @@ class ConsoleNode:
         self.node.create_subscription(Log, "/rosout", self._take_line, profile)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         self.watched = {name: ExternalGoals(self.node, client.INTERFACES[name], name) for name in LONG}
+        self._connection.start()
 
     def _take(self, topic: str, message: Any) -> None:
         if topic == "actuator_state":

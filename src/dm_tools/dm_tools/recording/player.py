@@ -73,6 +73,7 @@ def play(
         BagError: the file is damaged.
     """
     with closing(Connection("dm_player", "", domain, topics={}, watched={})) as connection:
+        connection.start()
         node, publishers = connection.node, {}
         for topic in [bag.topics[name] for name in names]:
             try:

@@ -69,6 +69,7 @@ class Recorder:
         self._since_ns = time.time_ns() - time.monotonic_ns()
         self._connection = Connection("dm_recorder", "", domain, topics={}, watched={})
         self._node = self._connection.node
+        self._connection.start()
         try:
             self._bag = BagWriter(folder)  # once ROS has started: else it would leave a folder
         except BaseException:
