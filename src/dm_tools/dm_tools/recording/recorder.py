@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import Parameter, ParameterEvent
+from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -172,19 +172,25 @@ class Recorder:
 
     def _on_listed(self, path: str, node: bytes, listed: Any) -> None:
         """Fetch the values of the names listed; they are recorded as if the node began now."""
-        names = listed.result().result.names
+        client, names = self._clients[path], listed.result().result.names
 
-        def keep(answer: Any) -> None:
-            values = answer.result().values
-            if len(values) != len(names):  # the node was just started again: it is asked again
+        # If one of the parameters asked for has no value any more, rclpy returns no values at all: it is asked again.
+        def fetch(answer: Any) -> None:
+            if len(types := answer.result().types) == len(names):
+                typed = zip(names, types, strict=True)
+                known = [name for name, type_number in typed if type_number != ParameterType.PARAMETER_NOT_SET]
+                client.get_parameters(known).add_done_callback(lambda answer: keep(known, answer.result().values))
+
+        def keep(known: Sequence[str], values: Sequence[Any]) -> None:
+            if len(values) != len(known):
                 return
-            given = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=True)]
+            given = [Parameter(name=name, value=value) for name, value in zip(known, values, strict=True)]
             event = serialize_message(ParameterEvent(node=path, new_parameters=given))
             # Stamped with the time of its discovery: later changes are recorded after it and replace its values.
             self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, event, self._seen[node]))
             self._asked[node] = math.inf
 
-        self._clients[path].get_parameters(names).add_done_callback(keep)
+        client.get_parameter_types(names).add_done_callback(fetch)
 
     # --- in the writer's thread ---
 
