@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import queue
 import re
 import threading
@@ -12,13 +13,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import rclpy
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
 
 from dm_bringup.nodes import NAMES
-from dm_client.connection import Connection
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagWriter, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 
@@ -28,6 +32,8 @@ DISCOVERY_PERIOD_S = 0.25
 ASK_AGAIN_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
+#: Longest sleep of the executor, s; only bounds how soon it ends.
+SPIN_S = 0.1
 #: The writer flushes after this time without a message, s; with `FLUSH_NS` no message waits longer than five seconds.
 IDLE_S = 1.0
 #: Topic of the maps themselves, several megabytes each; the results of their fits are on other topics.
@@ -65,16 +71,17 @@ class Recorder:
         self._maps = maps
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()  # of the writer; None = the end
         self._failure: Exception | None = None
+        self._stopping = False
         # Times are of a clock that is never set: messages keep their order.
         self._since_ns = time.time_ns() - time.monotonic_ns()
-        self._connection = Connection("dm_recorder", "", domain, topics={}, watched={})
-        self._node = self._connection.node
-        self._connection.start()
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._bag = BagWriter(folder)  # once ROS has started: else it would leave a folder
         except BaseException:
-            self._connection.close()
+            self._context.try_shutdown()
             raise
+        self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
         self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
         self._writer.start()
         self._subscribed: set[str] = set()
@@ -82,7 +89,13 @@ class Recorder:
         # By publisher of a node's parameter events: when to ask it again (monotonic, s); when it was first seen, ns.
         self._asked: dict[bytes, float] = {}
         self._seen: dict[bytes, int] = {}
+        self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
+        # The events executor cannot pass on serialised messages (it fails on raw subscriptions).
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._spinning = threading.Thread(target=self._spin, name="recorder", daemon=True)
+        self._spinning.start()
 
     def _now_ns(self) -> int:
         return self._since_ns + time.monotonic_ns()
@@ -107,7 +120,11 @@ class Recorder:
 
     def __exit__(self, *_error: object) -> None:
         """Leave the ROS graph and finish the recording. Raises OSError when not everything could be written."""
-        self._connection.close()
+        self._stopping = True
+        self._spinning.join(10.0 * SPIN_S + 1.0)
+        self._executor.shutdown(1.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
         self._jobs.put(None)
         self._writer.join()
         try:
@@ -116,6 +133,13 @@ class Recorder:
             self.check()
 
     # --- in the executor's thread ---
+
+    def _spin(self) -> None:
+        try:
+            while not self._stopping:
+                self._executor.spin_once(SPIN_S)
+        except Exception as error:  # otherwise the recording would silently continue without messages
+            self._failure = error
 
     def _discover(self) -> None:
         """Subscribe to topics that are new."""
