@@ -969,6 +969,8 @@ def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:
     assert (bench.signals == shape).all()
     bench.wait(3.0)
     assert (bench.signals == shape).all() and not bench.controller.hold.active
+    bench.wait(5.0)
+    assert not any("not confirmed" in line for line in bench.log), "it is no trouble"
 
 
 def test_a_new_calibration_while_a_shape_is_held(bench: Bench) -> None:
