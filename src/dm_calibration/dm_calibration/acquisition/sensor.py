@@ -37,8 +37,7 @@ def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[S
     """Map and measurement from what a sensor saw: over the configured aperture, else over that of the sensor.
 
     Raises:
-        MapRejectedError: the aperture is larger than the sensor's.
-        MapRejectedError, InsufficientDataError: see :class:`Ingest`.
+        MapRejectedError, InsufficientDataError: see :class:`Ingest`; also if the aperture is larger than the sensor's.
     """
     surface, residual_rms = seen
     settings = replace(settings, pitch=0.0)  # the parameter applies to a camera only
