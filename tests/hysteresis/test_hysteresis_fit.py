@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dm_calibration.calibrator import fit_effective
+from dm_calibration import calibrator
+from dm_calibration.calibrator import calibrate, fit_effective
 from dm_calibration.hysteresis import hysteresis_fit
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.features import play_values
@@ -19,6 +20,7 @@ from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, run_of
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.screening import FitOptions
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.errors import MeasurementError
@@ -47,7 +49,7 @@ class Blinking(SimulatedBench):
 
 
 @cache
-def run(blind: tuple[str, ...] = (), low: float = -1.0) -> MapSet:
+def outcome(blind: tuple[str, ...] = (), low: float = -1.0) -> Outcome:
     """Of a mirror whose signals go from `low` to 1."""
     bench = Blinking(SimulationConfig(law="prandtl_ishlinskii", seed=23, pixels=120))
     bench.blind = blind
@@ -56,7 +58,11 @@ def run(blind: tuple[str, ...] = (), low: float = -1.0) -> MapSet:
     procedure = Procedure(
         make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=MAPS)), bench.mirror, bench
     )
-    return procedure.run().maps()
+    return procedure.run()
+
+
+def run(blind: tuple[str, ...] = (), low: float = -1.0) -> MapSet:
+    return outcome(blind, low).maps()
 
 
 @cache
@@ -130,6 +136,23 @@ def test_a_map_that_contradicts_effective_signals_is_not_in_their_influence_func
     sag[wrong] += basis(maps.points.x, maps.points.y)[:, : maps.terms] @ surface
     fit = fit_effective(replace(maps, coefficients=coefficients, sag=sag), fitted(), FitOptions(), mirror)
     assert fit.reasons[wrong].startswith("outlier") and fit.used.sum() == len(maps) - 1
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_an_actuator_that_does_not_follow_now_and_then_is_named(monkeypatch: pytest.MonkeyPatch, times: int) -> None:
+    """Its contact opens: it stands at mid range in some maps, which are outliers. One of them may be anything."""
+    maps, mirror = run(), SimulatedBench(SimulationConfig(seed=23, pixels=120)).mirror
+    followed = fit_effective(maps, fitted(), FitOptions(), mirror)
+    moved = [row for row, signal in enumerate(maps.applied[:, 8]) if abs(signal) > 0.6][:times]
+    coefficients, sag = maps.coefficients.copy(), maps.sag.copy()
+    coefficients[moved] -= maps.applied[moved, 8:9] * followed.influence_zernike[:, 8]
+    sag[moved] -= maps.applied[moved, 8:9] * followed.influence_sag[:, 8]
+    monkeypatch.setattr(calibrator, "fit_hysteresis", lambda *_, **__: fitted())
+    monkeypatch.setattr(Outcome, "maps", lambda _: replace(maps, coefficients=coefficients, sag=sag))
+    said = calibrate(outcome(), mirror=mirror).limitations
+    labels = ", ".join(maps.label[row] for row in moved)
+    sentence = f"Actuator 9 did not follow its command in 3 of the 3 maps left out as outliers ({labels})"
+    assert sum(sentence in each for each in said) == sum("did not follow" in each for each in said) == (times > 1)
 
 
 def test_creep_of_before_is_found_though_each_wrong_map_hides_the_next() -> None:

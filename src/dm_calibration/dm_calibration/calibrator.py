@@ -19,6 +19,7 @@ from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
 from dm_calibration.influence.screening import LAW_ERRORS
 from dm_calibration.procedure.outcome import Outcome
+from dm_calibration.recalibration.not_followed import not_followed
 from dm_calibration.store.calibration_store import new_id
 from dm_common import Floats
 from dm_common.mirror import Mirror
@@ -149,7 +150,7 @@ def calibrate(
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
     limitations += _poke_sentences(check)
     limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
-    return Calibration(
+    made = Calibration(
         id=provenance.id,
         mirror_name=mirror.name,
         mirror_serial=mirror.serial,
@@ -162,13 +163,13 @@ def calibrate(
         fit=fit,
         dropped=tuple(outcome.dropped),
         targets=tuple(outcome.targets),
-        limitations=tuple(limitations),
         note=provenance.note,
         software_version=software_version(),
         hysteresis=found,
         **{name: getattr(outcome.setup, name) for name in _INSTRUMENT if outcome.setup},
         region_weights=_region_weights(measured, fit, options),
     )
+    return replace(made, limitations=(*limitations, *not_followed(made)))
 
 
 def _poke_sentences(check: PokeCheck) -> list[str]:

@@ -147,7 +147,7 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
         return f"{found}; ./dm check --forget takes it back"
     if silent[sure].any():
         return f"{found}; ./dm calibrate measures it"
-    if not sure or not all(_failed(displaced[k]) for k in sure) or len(sure) + given_up.sum() >= len(expected):
+    if not sure or not all(failed(displaced[k]) for k in sure) or len(sure) + given_up.sum() >= len(expected):
         return found
     without = " ".join(f"--without {actuator + 1}" for actuator in sure)
     condition = "if it is at the same place in another shape, " if "weakened" in faults else ""
@@ -166,12 +166,13 @@ def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernik
     """
     furthest = np.zeros(len(expected))
     for actuator, one in displaced.items():
-        if _failed(one):
+        if failed(one):
             furthest[actuator] = 1.0 + abs(expected[actuator] + one.more)
     return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
 
 
-def _failed(one: Displaced) -> bool:
+def failed(one: Displaced) -> bool:
+    """Whether an actuator is surely, and far enough, from where it should stand to have failed."""
     return one.probability >= SURE and abs(one.more) >= FAILED_SIGNAL
 
 
