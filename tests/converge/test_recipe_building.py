@@ -245,3 +245,11 @@ def test_a_map_of_another_surface_does_not_count_in_a_round() -> None:
     wrong = Shape(3e-8 * rng.standard_normal(21), np.zeros(4))
     assert agreeing_maps([*maps[:3], wrong, *maps[3:]]) == maps
     assert len(agreeing_maps([*maps[:2], wrong])) == 3, "two say nothing against one"
+
+
+def test_maps_left_out_are_counted() -> None:
+    plant = LinearPlant(GAINS)
+    plant.disturb[1] = 30e-9
+    builder = RecipeBuilder(LOOP, plant, lambda: plant.time, BuildOptions(tolerance=1e-9))
+    assert plant.left(builder.build(FocusTarget(0.02))) < 1e-9
+    assert builder.left_out == 1

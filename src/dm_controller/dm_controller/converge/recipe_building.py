@@ -96,7 +96,7 @@ class RecipeBuilder:
         on_step: called after each map; `cancelled` before each.
 
     Attributes:
-        maps: taken altogether.
+        maps, left_out: taken altogether, and those of them that contradicted the others of their round.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class RecipeBuilder:
         self._middle = limits.middle
         actuators = model.influence_zernike.shape[1]
         self.state = state if state is not None else loop.law.demagnetised(actuators, now(), self._middle)
-        self.maps = 0
+        self.maps = self.left_out = 0
         self._defects = Defects(model)
         self._built: list[tuple[_Round, int]] = []
 
@@ -228,6 +228,7 @@ class RecipeBuilder:
             sure = number >= MAPS_MIN and self._defects.spread(agreeing) <= SURE_SHARE * options.tolerance
             if sure or number == options.average:
                 break
+        self.left_out += len(defects) - len(agreeing)
         self._defects.add(aim, agreeing)
         self.state = law.advance(self.state, self._now())
         return taken

@@ -122,6 +122,8 @@ class RecipeRun:
             if result.recipes
             else "no recipe was stored"
         )
+        if builder.left_out:
+            figures += f"; left out {builder.left_out} of {result.maps} maps that contradicted the rest of their round"
         return code, "; ".join(filter(None, (text, figures, rest)))
 
     def _planner_now(self, active: ActiveCalibration) -> Planner:
