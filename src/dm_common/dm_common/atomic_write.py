@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, whatever happens meanwhile."""
+"""Files that are written whole or not at all, even if the power fails meanwhile."""
 
 import os
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ def storing(failure: str) -> Iterator[None]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write `content` to a temporary file beside `path` and put it in its place in one step; the folder is made.
+    """Write `content` to a temporary file and rename that to `path` in one step; the folder is created if needed.
 
     Raises:
         OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
@@ -42,7 +42,7 @@ def write_whole(path: Path, content: bytes) -> None:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
-    # The file is complete already: network file systems may refuse to sync a folder, which loses no name.
+    # Some network file systems cannot sync a folder; the file is complete and has its name nevertheless.
     with suppress(OSError):
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:

@@ -3,15 +3,15 @@
     minimise   |M s - b|^2 + ridge |s|^2
     subject to low <= s_i <= high,   |s_i - s_j| <= d for neighbours i, j
 
-M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. The unconstrained solution
-is taken if it lies inside all limits. Otherwise block principal pivoting [10] guesses which signals are at an end of
-their range, solves for the others, and changes all that are on the wrong side at once; a few rounds usually end at the
-optimum, where nothing is on the wrong side. Where pivoting does not settle, and where differences between neighbours
-can bind, the problem is solved as one of least distance by non-negative least squares ([9], chapter 23) and checked
-against the optimality conditions: one signal enters per round, so time grows with saturation. Bounded-variable least
-squares (BVLS [11]) steps in where that check fails, which takes condition numbers from 1e4 on; alone it takes many
-times longer, and at SciPy's default number of iterations it stops far from the optimum (measured on a PDM30-37: 13 nm
-rms instead of 6).
+M is factored once (M = Q R), so a solve works on N x N numbers, however many rows M has. The unconstrained solution is
+taken if it lies inside all limits. Otherwise block principal pivoting [10] guesses which signals are at an end of their
+range, solves for the others, and exchanges all signals on the wrong side at once; a few rounds usually reach the
+optimum, where no signal is on the wrong side. If pivoting does not settle, or if the limit between neighbours can bind,
+non-negative least squares solve the equivalent least-distance problem ([9], chapter 23), and the result is checked
+against the optimality conditions. One signal enters per round, so time grows with saturation. If that check fails,
+which happens only at condition numbers above 1e4, bounded-variable least squares (BVLS [11]) take over. BVLS alone take
+many times longer, and with SciPy's default number of iterations they stop far from the optimum (measured on a PDM30-37:
+13 nm rms instead of 6).
 
 Clipping the unconstrained solution instead can double the residual of a saturated sphere.
 """
@@ -25,9 +25,9 @@ from scipy.optimize import lsq_linear, nnls
 from dm_common import Bools, Floats
 from dm_common.limits import SLACK, Limits
 
-#: A signal this close to an end of its range is taken to be bound there.
+#: A signal (normalised) this close to an end of its range counts as bound there.
 NEAR_LIMIT = 1e-5
-#: Optimality: a gradient up to this counts as zero, as a share of the largest gradient at zero signals.
+#: Optimality: a gradient counts as zero up to this share of the largest gradient at zero signals.
 OPTIMALITY = 1e-9
 #: Maximum rounds of block pivoting, and rounds without progress (at least as many signals on the wrong side as in the
 #: best round so far) after which the least-distance method takes over. Pivoting may cycle otherwise.
@@ -39,7 +39,7 @@ ROUNDING = 1e-13
 
 
 class BoundedProgramme:
-    """The quadratic programme above for one matrix and one set of limits.
+    """The quadratic programme of this module for one matrix and one set of limits.
 
     Args:
         matrix: (M, N), M >= N rows, or fewer with `ridge` > 0.
@@ -67,7 +67,7 @@ class BoundedProgramme:
         self._constraints, self._constraint_limits = self._linear_constraints(count)
 
     def _linear_constraints(self, count: int) -> tuple[Floats, Floats]:
-        """The pair (C, c0) of the constraints C y >= c0 - C d, where y = R s - d, see `_least_distance`."""
+        """The pair (C, c) of the constraints C y >= c - C q on y = R s - q, where q = Q^T b; see `_least_distance`."""
         limits, identity = self.limits, np.eye(count)
         pairs = limits.pairs if limits.neighbours_can_bind else limits.pairs[:0]
         differences = identity[pairs[:, 0]] - identity[pairs[:, 1]]
@@ -170,9 +170,9 @@ class BoundedProgramme:
         return result if self.limits.allow(result) else signals
 
     def _least_distance(self, projected: Floats) -> Floats:
-        """Problem LDP of [9]: the shortest y = R s - d that satisfies all constraints."""
+        """Problem LDP of [9]: the shortest y = R s - q that satisfies all constraints; `projected` is q = Q^T b."""
         right = self._constraint_limits - self._constraints @ projected
-        size = max(float(np.abs(right).max()), 1.0)  # a target far away: the distance would lose its digits
+        size = max(float(np.abs(right).max()), 1.0)  # scaled, so that a distant target does not cost digits
         system = np.vstack([self._constraints.T, right / size])
         unit = np.zeros(len(system))
         unit[-1] = 1.0

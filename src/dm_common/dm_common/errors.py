@@ -1,4 +1,4 @@
-"""What can go wrong with a request, and the code that answers it. Knows no ROS."""
+"""Errors of requests, with the codes that report them. Independent of ROS."""
 
 import difflib
 from collections.abc import Iterable
@@ -51,7 +51,7 @@ class ErrorCode(IntEnum):
 
 
 class CodedError(RuntimeError):
-    """A failure that is answered with a code and a sentence that a person can act on.
+    """A failure that is reported by a code and a sentence that a person can act on.
 
     Errors about a value, where callers expect a ValueError, derive from both classes.
 
@@ -66,7 +66,7 @@ class Refusal(CodedError):
     """A request that is not carried out.
 
     Attributes:
-        actuators: (N,) bool, True for the actuators at fault; None when it is not about single actuators.
+        actuators: (N,) bool, True for the actuators at fault; None if it is not about single actuators.
     """
 
     def __init__(self, error_code: int, message: str, actuators: Bools | None = None) -> None:
@@ -80,13 +80,13 @@ class MeasurementError(Refusal):
 
 
 class Cancelled(CodedError):
-    """A procedure was asked to stop."""
+    """A procedure was cancelled."""
 
     error_code = ErrorCode.CANCELED
 
 
 class UnknownNameError(CodedError, ValueError):
-    """An unknown name; the message lists similar names, or says where it was looked for."""
+    """An unknown name; the message lists similar names, or says where the name was searched for."""
 
     error_code = ErrorCode.UNKNOWN_NAME
 
@@ -106,15 +106,15 @@ class ClockError(CodedError, TimeoutError):
     error_code = ErrorCode.TIMEOUT
 
 
-#: Message when nothing can be predicted or corrected because no calibration is in use, with what to do.
+#: Message when nothing can be predicted or corrected because no calibration is in use; it says what to do.
 NO_CALIBRATION = "no calibration is in use: run `./dm calibrate` or load_calibration"
-#: Prefix of the part of the message of `capabilities` that says why the history of the actuators is not known.
+#: In the message of `capabilities`, precedes the reason why the history of the actuators is not known.
 HISTORY_UNKNOWN = "wider error bound: "
 
-#: Failures that are answered with a code and a message; anything else is a defect.
+#: Failures that are reported by a code and a message; any other exception is a defect.
 EXPECTED = (CodedError, ValueError)
 
 
 def error_code(error: Exception) -> int:
-    """The code that answers one of the EXPECTED failures: its own, or INVALID_ARGUMENT for a plain ValueError."""
+    """The code of one of the EXPECTED failures: its own, or INVALID_ARGUMENT for a plain ValueError."""
     return error.error_code if isinstance(error, CodedError) else ErrorCode.INVALID_ARGUMENT

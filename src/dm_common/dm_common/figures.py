@@ -15,7 +15,7 @@ def in_nanometres(length: float) -> str:
 
 
 def told_from(length: float, other: float) -> str:
-    """A length (m) with enough digits to distinguish it from `other`, at least two, such as 2.04 nm."""
+    """A length (m) with two digits, or as many as distinguish it from `other` (m), such as 2.04 nm."""
     text, beside = in_nanometres(length), in_nanometres(other)
     for digits in (3, 4, 5):
         if text != beside or length >= 1e-6:
@@ -30,19 +30,19 @@ def in_wavelengths(length: float, wavelength: float) -> str:
 
 
 def with_wavelengths(text: str, length: float, wavelength: float) -> str:
-    """The text of a length (m), followed by the same as a fraction of the wavelength in brackets, up to λ/5."""
+    """The `text` of a `length` (m), followed in brackets by the length as a fraction of the wavelength, up to λ/5."""
     share = in_wavelengths(length, wavelength)
     return f"{text} ({share})" if share else text
 
 
 def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
-    """Say how well open-loop moves repeat, how accurate they are in absolute terms, and what limits that.
+    """Text on the repeatability and the absolute accuracy of open-loop moves, and on the limit of the latter.
 
     Args:
         repeatable: 95 % bound on the largest coefficient error against the maps of the calibration, m; 0 = not known.
         calibration: its `wavelength`, `aperture_radius` (m), `instrument_error` (m) and `scale_error`.
-        curvature: for which this holds, 1/m; for a range, the end farther from 0. A relative error of the lateral scale
-            gives twice that relative error in the curvature.
+        curvature: of the moves, 1/m; for a range, its end farther from 0. A relative error of the lateral scale gives
+            twice that relative error in the curvature.
     """
 
     def length(metres: float) -> str:

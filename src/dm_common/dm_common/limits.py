@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from dm_common import Bools, Floats
 
-#: Violations below this are rounding, far below a DAC step (1.5e-5).
+#: Violations up to this count as rounding; it is far below a DAC step (1.5e-5, in normalised signals).
 SLACK = 1e-9
 #: Signals closer to a limit than this count as standing at it.
 AT_LIMIT = 1e-6
-#: Fewest half-swings of a degauss that wipes the hysteresis. With n of them up to 1 / (2 n) of the first remains; if
-#: that is more than a tenth, the state is not the demagnetised one that is assumed after a degauss.
+#: Fewest half-swings of a degauss that wipes out hysteresis. After n of them, up to 1 / (2 n) of the first one remains;
+#: with more than a tenth left, the mirror is not in the demagnetised state that is assumed after a degauss.
 DEGAUSS_STEPS_MIN = 5
 #: Most half-swings of a degauss: with more, the last ones would be smaller than a step of the electronics.
 DEGAUSS_STEPS_MAX = 10000
@@ -87,7 +87,7 @@ class Limits:
         return result
 
     def scaled(self, signals: Floats) -> tuple[Floats, float]:
-        """`signals` (N,) scaled about their mean until they keep every limit, and the factor (1: nothing changed).
+        """`signals` (N,) scaled about their mean so that they keep every limit, and the factor (1 = unchanged).
 
         A common signal lifts the plate without bending it, so scaling about the mean keeps the shape and changes its
         size.

@@ -1,4 +1,4 @@
-"""What a calibration measures and what it drives. Knows no ROS."""
+"""Maps as measurements, and the bench that a calibration drives. Independent of ROS."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from dm_common.optics.sampling import SamplePoints
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """One measured map: what the interferometer saw, and, in a run or a calibration, what had been commanded.
+    """One measured map and, in a run or a calibration, its command.
 
     Attributes:
         points: where the map was sampled.
         sag: (P,) at these points, m; NaN = no data.
         coefficients, sigma: (K,) Zernike coefficients and their standard deviations (NaN = unknown), m.
         stamp_ns: time of the measurement, ns; 0 = not known.
-        residual_rms: what the K terms leave unexplained, m.
+        residual_rms: rms of the map less its K terms, m.
         valid_fraction: valid pixels of the aperture, 0..1.
         radius: of the aperture the coefficients and points are normalised to, m; 0 = unknown.
         wavelength: m; 0 = unknown.
         system_error_subtracted: 1 yes, 0 no, -1 not known.
-        reference_surface: the map that was subtracted as the instrument's error, and its SHA-256; "" = none.
-        instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.
+        reference_surface: instrument errors subtracted, as text: map with SHA-256, retrace, distortion; "" = none.
+        instrument_error: 95 % bound on the instrument error that remains in a coefficient, m; 0 = not known.
         scale_error: 95 % bound on the relative error of pitch and radius; 0 = not known.
         file, sha256: the map file it came from; "" = none.
         moved_ns: when the mirror took the shape, ns; 0 = not known.
-        instrument: what took the map, with its serial number; "" = not known.
+        instrument: that took the map, with its serial number; "" = not known.
         pitch: m per pixel; 0 = unknown.
         camera: width and height of the map, pixels; zeros = not known.
         centre: of the aperture from the left and top edge of the map, pixels; NaN = not known.
@@ -38,10 +38,10 @@ class Measurement:
         radius_px: of the aperture, pixels; 0 = not known.
         orientation: how the instrument's picture was turned: flips of x and y, then counter-clockwise by degrees.
         label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``; "" = not commanded by a run.
-        kind: reference, poke, surface, excitation (shows hysteresis) or check (a move as in use, tests its model).
+        kind: as `dm_calibration.influence.maps.StepKind`, e.g. reference or poke; "" = not of a calibration.
         step: index of the commanded state; maps repeated in one state share it.
         signals, applied: (N,) normalised signals as requested and as written to the electronics.
-        nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
+        nominal: (K,) coefficients of the intended surface, m; None when signals were prescribed.
         segment: number of the degauss, or of the resumption, from which the history of the actuators is known; 0 for a
             run that was not interrupted.
         temperature: of the mirror, degC; NaN = not known.

@@ -31,12 +31,12 @@ def doubles(values: Floats) -> array[float]:
 
 
 def taken(source: Any, *names: str) -> dict[str, Any]:
-    """Fields of `source` by name, for a target whose fields have the same names."""
+    """The fields `names` of `source` as keyword arguments for a target with fields of the same names."""
     return {name: getattr(source, name) for name in names}
 
 
 def answer_with(answer: Any, code: int, text: str) -> None:
-    """Set code and sentence in an answer, and in the FocusState inside it, as far as they have these fields."""
+    """Set error code and message in an answer, and in a FocusState inside it, if they have these fields."""
     each: Any
     for each in (answer, getattr(answer, "state", None)):
         if hasattr(each, "error_code"):
@@ -62,7 +62,7 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     """The mirror that the driver describes.
 
     Raises:
-        ValueError: naming the field that makes no sense.
+        ValueError: a field is invalid; the message names it.
     """
     for name in ("actuator_x", "actuator_y"):
         if len(getattr(message, name)) != message.actuators:
@@ -137,8 +137,8 @@ def measurement_from(response: Any) -> Measurement:
 
 
 def unused_as_requested(report: ActuatorState) -> ActuatorState:
-    """Set what was applied to actuators without a channel to what was requested of them: they cannot move, so the
-    difference is no shape to correct or to keep.
+    """For actuators without a channel, set the applied signals to the requested ones: they cannot move, so the
+    difference is not a shape to correct or to keep.
     """
     unused = np.bitwise_and(np.asarray(report.flags, dtype=np.uint8), ActuatorState.FLAG_UNUSED) > 0
     if unused.any() and len(report.requested) == len(report.applied) == len(unused):
@@ -166,7 +166,7 @@ def _shaped(name: str, values: array[float], *shape: int, own: bool = False) -> 
     """A field of the hysteresis model in this shape (-1 = any length); empty = the model has none.
 
     Args:
-        own: whether it may hold one array for each actuator.
+        own: whether the field may hold one array for each actuator.
     """
     field = np.array(values, dtype=np.float64)
     if not field.size:
@@ -182,7 +182,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     """The hysteresis model in a message; None when none was identified.
 
     Raises:
-        ValueError: naming the field that makes no sense.
+        ValueError: a field is invalid; the message names it.
     """
     radius = np.array(message.play_radius, dtype=np.float64)
     if not radius.size:
@@ -218,7 +218,7 @@ _STATE = ("signals", "position", "play", "fading", "crept", "crept_sigma", "lagg
 
 
 def estimate_message(observer: HysteresisObserver) -> ActuatorEstimateMsg:
-    """What an observer knows as a message; no arrays before the driver's first report."""
+    """The estimate of an observer as a message; without arrays before the driver's first report."""
     state, unknown = observer.state, observer.unknown
     message = ActuatorEstimateMsg(history_known=not unknown, message=unknown)
     if state is not None:

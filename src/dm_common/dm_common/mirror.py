@@ -1,4 +1,4 @@
-"""Geometry and limits of a mirror, what its driver reports, and whether a calibration belongs to it."""
+"""Geometry and limits of a mirror, the reports of its driver, and the check whether a calibration belongs to it."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from dm_common.limits import Limits
 
 #: Largest relative difference between the aperture radii of a calibration and of the mirror that it belongs to.
 APERTURE_TOLERANCE = 0.02
-#: Largest coordinate of an actuator, m: a larger one indicates another unit.
+#: Largest coordinate of an actuator, m; a larger one must be in another unit.
 FARTHEST_M = 1.0
 
 
@@ -88,18 +88,18 @@ def mismatch(
 
 @dataclass(frozen=True, eq=False)
 class Applied:
-    """What a driver reports; fields as in dm_msgs/ActuatorState.
+    """A report of the driver; fields as in dm_msgs/ActuatorState.
 
     Attributes:
         time: s, stamp of the last write.
         signals: (N,) applied.
         turns, turned_at: number of turns since activation, and (N,) signals at the last one; None = there was none.
-        degausses: number of them over the full range since activation.
+        degausses: number of full-range degausses since activation.
         history_known: no write was lost since the last degauss.
         moving: on the way to another shape.
-        requested: (N,) what it moves to; None = not known.
-        active: the electronics follow.
-        linked: the electronics are in reach.
+        requested: (N,) the shape it moves to; None = not known.
+        active: the driver is active, so the electronics follow commands.
+        linked: the electronics are reachable.
         heard: s, when the driver last sent this; a repeated report confirms that the shape is still held.
     """
 

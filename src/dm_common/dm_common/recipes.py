@@ -1,8 +1,8 @@
-"""Recipes: what produces a shape from a defined condition (the control-parameter database of [1]).
+"""Recipes: signals that produce a shape from a defined initial state (the control-parameter database of [1]).
 
-The condition is a mirror degaussed over the full range about mid range. A recipe stores the *effective* signals at
-which the surface had the wanted shape; the hysteresis model gives the command that produces them at any later time and
-creep. On a mirror without an identified model they are the signals themselves.
+The initial state follows a degauss over the full range about mid range. A recipe stores the *effective* signals at
+which the surface had the wanted shape; from these, the hysteresis model finds the command for any later time and state
+of creep. On a mirror without an identified model they are the signals themselves.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
 
-#: Prefix of the limitation of a calibration that is used without some actuators; recipes are of all of them.
+#: Prefix of the limitation of a calibration that is used without some actuators; its recipes, of all, are withheld.
 GOES_ON_WITHOUT = "Goes on without actuator"
 
 
 class RecipeError(ValueError):
-    """A recipe outside its range, or made under another condition or for another mirror."""
+    """A recipe outside its range, or made from another initial state or for another mirror."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class Recipe:
         max_zernike, rms: m, re-measured: largest coefficient error beyond tilt, sag error.
         maps: number of maps taken to find it.
         zernike: m, added sag, as requested; () = none.
-        by_model: (N,) effective signals that the calibration gave for the shape at that time: later changes of the
-            calibration shift the recipe as well; empty = not known.
+        by_model: (N,) effective signals that the calibration gave for the shape when the recipe was built, so that
+            later changes of the calibration can shift the recipe; empty = not known.
     """
 
     curvature: float
@@ -52,12 +52,12 @@ class Recipe:
 
     @property
     def series(self) -> tuple[float, tuple[float, ...]]:
-        """What it shares with shapes that differ in curvature alone: conic constant and added terms."""
+        """Conic constant and added terms: shapes of one series differ in curvature alone."""
         return self.conic_constant, self.zernike if any(self.zernike) else ()
 
     @property
     def shape(self) -> tuple[float, tuple[float, ...], float]:
-        """What identifies it among all recipes: its series, and its curvature."""
+        """Series and curvature, which identify a recipe among all."""
         return *self.series, self.curvature
 
 
@@ -67,10 +67,10 @@ class RecipeBook:
 
     Attributes:
         recipes: by rising conic constant, added terms, curvature.
-        degauss_steps: half-swings of the degauss before them; without recipes, of those that are withheld.
-        interpolation_error: m, by how much the bound halfway between neighbours exceeds what was re-measured, when the
-            last were built.
-        stamp_ns: when the last was built.
+        degauss_steps: half-swings of the degauss before each; kept when recipes are withheld.
+        interpolation_error: m, how far the error bound halfway between two recipes exceeds the re-measured error, when
+            the last recipes were built.
+        stamp_ns: when the last recipe was built.
     """
 
     recipes: tuple[Recipe, ...]
@@ -90,7 +90,7 @@ class RecipeBook:
                 raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
 
     def check_condition(self, degauss_steps: int) -> None:
-        """Raise RecipeError when recipes after a degauss of this many half-swings cannot join these."""
+        """Raise RecipeError if these recipes begin with a degauss of another number of half-swings."""
         if self.degauss_steps and degauss_steps != self.degauss_steps:
             raise RecipeError(
                 f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}: "
@@ -101,7 +101,7 @@ class RecipeBook:
         """The book with recipes of `newer` in place of those of the same shape; the other fields are those of `newer`.
 
         Raises:
-            RecipeError: made under another condition.
+            RecipeError: the newer ones begin with another degauss.
         """
         self.check_condition(newer.degauss_steps)
         both = {recipe.shape: recipe for recipe in (*self.recipes, *newer.recipes)}
@@ -115,7 +115,7 @@ def terms_text(zernike: Sequence[float]) -> str:
 
 
 def recipe_row(recipe: Any) -> tuple[str, ...]:
-    """Curvature, conic constant, added terms, re-measured errors in nm and maps of a recipe or its message, as text."""
+    """A recipe, or its message, as texts: curvature, conic constant, added terms, re-measured errors (nm), maps."""
     return (
         f"{recipe.curvature:+.4f}",
         f"{recipe.conic_constant:g}",
@@ -130,7 +130,7 @@ def terms_of(text: str) -> list[float]:
     """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names of SPOKEN.
 
     Raises:
-        ValueError: naming what is no term, or no number, or comes twice.
+        ValueError: an unknown or repeated term, or a value that is not a number; the message names it.
     """
     terms: dict[str, float] = {}
     for part in text.split(","):

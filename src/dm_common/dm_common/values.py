@@ -1,4 +1,4 @@
-"""Allowed values of parameters and of fields of requests: declared in tables, checked in one place. Knows no ROS."""
+"""Allowed values of parameters and request fields: declared in tables, checked in one place. Independent of ROS."""
 
 import math
 import re
@@ -16,9 +16,9 @@ from dm_common.errors import ErrorCode, Refusal
 
 T = TypeVar("T")
 
-#: Most characters of a text that names or describes anything.
+#: Largest number of characters of a text in a parameter or request.
 TEXT_MAX = 1000
-#: Control characters, on which a terminal would act: others read such texts in refusals and logs.
+#: Control characters that a terminal would execute: such texts appear in refusals and logs.
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 
@@ -27,7 +27,7 @@ class Value:
     """Constraints on a value; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
 
     Attributes:
-        kind: bool, int, float or str; of an array that of its elements.
+        kind: bool, int, float or str; for an array, that of its elements.
         default: the value when none is given.
         low, high: allowed range of numbers (of each element for arrays), inclusive.
         unit: SI unit, "" when it has none.
@@ -73,7 +73,7 @@ class Value:
             self._check_array(name, given)
         elif self.kind is str:
             self._check_text(name, given)
-        # Most numbers are right, and a request on its way to the mirror waits for this: without NumPy.
+        # First without NumPy: most numbers are right, and requests to the mirror wait for this check.
         elif not (self.low <= given <= self.high and (self.infinite or math.isfinite(given))):
             self._check_numbers(name, np.array([given], dtype=float), f"{name} = {given}")
 
@@ -91,7 +91,7 @@ class Value:
             self._check_numbers(name, np.asarray(given, dtype=float), "")
 
     def _check_numbers(self, name: str, given: Floats, subject: str) -> None:
-        """`subject`: name and value as they were given; "" = name the first wrong element of an array."""
+        """`subject`: name and value as given, for the message; "" = those of the first wrong element of an array."""
         right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
         if self.zero:
             right |= given == 0.0
@@ -152,7 +152,7 @@ def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **ot
 
 
 def check_parameters(of: Any) -> None:
-    """Check the fields of a dataclass that are parameters too, as a node checks these. Raises Refusal naming one."""
+    """Check the fields of a dataclass that are also parameters, as a node does. Raises Refusal naming the wrong one."""
     for each in fields(of):
         if "value" in each.metadata:
             each.metadata["value"].check(each.name, getattr(of, each.name))
@@ -171,7 +171,7 @@ class Fields:
 
 
 def without_figures(message: Any) -> Any:
-    """Set all numbers of `message`, nested ones too, to NaN: after a refusal none is known, and 0 would be a value."""
+    """Set all floats of `message`, nested ones too, to NaN: after a refusal none is known, and 0 would be a value."""
     for name, kind in message.get_fields_and_field_types().items():
         if kind == "double":
             setattr(message, name, math.nan)

@@ -1,4 +1,4 @@
-"""Creep state of the actuators, kept on disk: after a restart it is known what was held before, and for how long."""
+"""Creep state of the actuators on disk: a restarted node knows which shapes were held before, and for how long."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Folder in which the focus controller keeps its records, unless configured otherwise.
 STATE_FOLDER = "~/.ros/focus_controller"
-#: Standard deviation of a shape held unobserved, relative to one of the whole range: 2 sigma reach that.
+#: Standard deviation of a shape held unobserved, as a share of a full-range shape, which is thus at 2 sigma.
 UNSEEN = 0.5
-#: Time constant, s, above which a calibration run does not determine creep elements; relative error of their weights.
+#: Time constant, s, above which creep elements are too slow for a calibration run; relative error of their weights.
 SLOW_S, SLOW_SHARE = 300.0, 0.35
 
 
@@ -33,8 +33,8 @@ class CreepRecord(NamedTuple):
         creep_time: (J,) s, of the elements.
         crept: (N, J) states of the elements: effective signals, low-pass filtered.
         crept_sigma: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
-        lagged: (N, L) states of the first L elements, as far as they follow the signals themselves; where the law has
-            more such elements, and in records of older versions, `crept` is used instead.
+        lagged: (N, L) states of the first L elements that follow the signals themselves. If the law has more of these
+            elements, and for records of older versions, `crept` is used instead.
     """
 
     time: float
@@ -45,7 +45,7 @@ class CreepRecord(NamedTuple):
 
 
 def write_record(file: Path, record: CreepRecord) -> None:
-    """Replace `file` as a whole, also when the power fails meanwhile.
+    """Replace `file` in one step, so that a power failure leaves either the old or the new record.
 
     Raises:
         OSError: it cannot be written; the previous record is then unchanged.
@@ -64,7 +64,7 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
         now: s; 0 = not known, for instance before a simulator has published the time.
 
     Raises:
-        ValueError: the record cannot be used, with the reason; or `now` is before it was written (clock set).
+        ValueError: the record cannot be used (the message says why), or is later than `now`: the clock was set back.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
@@ -87,10 +87,10 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
 def rested(
     law: HysteresisModel, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
 ) -> HysteresisState:
-    """The state at `time` (s) of a mirror at `signals` (N,), if it has stood there since it was last known.
+    """The state at `time` (s) of a mirror at `signals` (N,), assumed to have stood there since its last known state.
 
-    Last known is the time of `record`, or of the calibration. Creep elements with time constants longer than the time
-    since then still hold what they held; what was held meanwhile is uncertain.
+    That state is the one in `record`, or the one in which the calibration found the mirror. Slow creep elements still
+    keep part of it; shapes that were held in between are not known and count by `crept_sigma`.
     """
     moved = law.move(law.demagnetised(len(signals), time, middle), signals, time)
     settled = np.repeat(moved.position[:, None], len(law.creep_time), axis=1)
@@ -112,18 +112,18 @@ def rested(
 
 
 def held_unseen(law: HysteresisModel, sigma: Floats, elapsed: float) -> Floats:
-    """(J,) `crept_sigma` after `elapsed` s at an unobserved shape; `sigma` is what is left of the earlier one."""
+    """(J,) `crept_sigma` after `elapsed` s at an unobserved shape; `sigma` (J,): the remainder of the earlier one."""
     return np.hypot(sigma, UNSEEN * -np.expm1(-max(elapsed, 0.0) / law.creep_time))
 
 
 def slow_creep(law: HysteresisModel, elapsed: float) -> float:
-    """Standard deviation of an effective signal due to slow creep that no run determines, `elapsed` s after a map."""
+    """Standard deviation of an effective signal by creep too slow for a run to determine, `elapsed` s after a map."""
     share = np.where(law.creep_time > SLOW_S, np.atleast_2d(law.creep_share).mean(axis=0), 0.0)
     return SLOW_SHARE * float(held_unseen(law, np.zeros(len(share)), elapsed) @ share)
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:
-    """The creep record at `now` (s); None without an identified creep, or without a state."""
+    """The creep record at `now` (s); None if the law has no creep, or without a state."""
     if state is None or not law.creep_rate:
         return None
     state = law.advance(state, now)
@@ -134,8 +134,8 @@ class CreepRecorder:
     """Keeps the record of the mirror that an observer follows.
 
     Args:
-        folder: of the records; may change; empty = nothing is kept.
-        warn: called, from any thread, with a message on what failed.
+        folder: of the records; may be reassigned; empty = nothing is kept.
+        warn: called from any thread with the message of a failure.
     """
 
     def __init__(self, folder: str, observer: HysteresisObserver, warn: Callable[[str], None]) -> None:
@@ -156,9 +156,9 @@ class CreepRecorder:
         self._observer.recall(record, another)
 
     def keep(self, now: float) -> None:
-        """Write what the actuators have crept to by `now` (s) to disk, if there is anything to keep.
+        """Write the creep state of the actuators at `now` (s) to disk, if it is known.
 
-        Without a link to the electronics the last record stays: it is not known whether the outputs hold.
+        Without a link to the electronics the last record stays, since the outputs may have changed.
         """
         latest = self._observer.latest
         if self._serial is None or latest is None or not latest.linked:

@@ -2,14 +2,14 @@
 
 ``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. A play operator keeps its memory
 until a larger swing wipes it out; this operator forgets exponentially with travel, as some ceramics do. f is a
-polynomial with fitted coefficients, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the true law of a mirror need not be one.
-Each actuator may have its own polynomials, and different ones for rising and falling moves.
+polynomial with fitted coefficients, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``, which only approximates a mirror's law. Each
+actuator may have its own polynomials, and different ones for rising and falling moves.
 
-u does not occur in f, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
+f does not depend on u, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
 
 Linear operators follow powers of the signal, each at its own rate: ``dz = u^p du - rate z |du|``. Their weighted sums
-are Coleman-Hodgdon laws [38] with arbitrary polynomials. They represent what a slope that depends on z alone cannot:
-domain walls that follow a curve of the signal [36].
+are Coleman-Hodgdon laws [38] with arbitrary polynomials. They represent domain walls that follow a curve of the signal
+[36], which a slope that depends on z alone cannot.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dm_common import Floats
 
-#: Largest |z| of a table.
+#: Range of a table, |z| <= REACH, and its number of points KNOTS (below).
 REACH = 2.5
 #: Longest straight move, from one end of the signal range to the other.
 FULL_SWING = 2.0
@@ -122,7 +122,7 @@ class FadingHysteresis:
             self._solutions[0, :, power, power] = 1.0 / rates
             if power:
                 self._solutions[:, :, power] -= power / rates[:, None] * self._solutions[::-1, :, power - 1]
-        # The same weighted by `drive` for each rate, then summed over rates by rising power, with the slope of the sum.
+        # Solutions weighted by `drive`, for each rate; then summed over the rates, by rising power; slope of this sum.
         self._sums = np.einsum("nkp,wkpq->wnkq", self._drive, self._solutions)
         self._curves = np.moveaxis(self._sums.sum(axis=2), 2, 1)[..., None]
         self._slopes = polyder(self._curves, axis=1) if powers else self._curves
@@ -137,7 +137,7 @@ class FadingHysteresis:
         return states[:, int(self._learned is not None) :].reshape(len(states), *self._drive.shape[1:])
 
     def move(self, states: Floats, signals: Floats, there: Floats) -> Floats:
-        """States (N, Z) after straight moves from `signals` (N,), where they are `states`, to `there` (N,)."""
+        """States (N, Z) after straight moves from `signals` (N,), in the states `states` (N, Z), to `there` (N,)."""
         change = there - signals
         moved = [states[:, :0] if self._learned is None else self._learned.move(states[:, 0], change)[:, None]]
         if self._rates.size:
@@ -155,10 +155,10 @@ class FadingHysteresis:
         return linear if self._learned is None else linear + self._learned_weight[:, 0] * states[:, 0]
 
     def along(self, states: Floats, signals: Floats, there: Floats, way: Floats) -> tuple[Floats, Floats]:
-        """Value and slope at `there` (..., N, P) on straight moves from `signals` (N,), where they are `states` (N, Z).
+        """Value and slope at `there` (..., N, P) on straight moves from `signals` (N,), in the states `states` (N, Z).
 
         Args:
-            way: 1 for rising, -1 for falling moves; broadcasts to the shape of `there`.
+            way: 1 for rising, -1 for falling moves; must broadcast to the shape of `there`.
         """
         change = there - signals[:, None]
         value = slope = np.zeros((1, 1))

@@ -4,10 +4,10 @@ On a straight move the play operators set in one after another, and between two 
 in the signal. The values of the law at all onsets identify the piece that holds the solution; Newton's method finds it
 there. The cost grows with actuators times operators.
 
-Where limits bind, they bind the signals, while the shape depends on the effective signals. So the programme is solved
-for the signals with the law linearised about the last solution (sequential quadratic programming); after a round
-without gain, half its step and the slopes of its chord are tried. A small weight on changes, without effect at
-convergence, keeps signals from moving far for what the surface hardly shows, such as piston. All rounds stay legal.
+Limits bind the signals, while the shape depends on the effective signals. So the programme is solved for the signals
+with the law linearised about the last solution (sequential quadratic programming). After a round that did not reduce
+the error, half its step and the slopes of its chord are tried. A small weight on changes, without effect at
+convergence, keeps signals from moving far for patterns that hardly show, such as piston. All rounds keep the limits.
 """
 
 from collections.abc import Iterator
@@ -23,18 +23,18 @@ from dm_common.hysteresis.duhem import horner
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 
-#: Accuracy to which effective signals are met; a DAC step is three hundred times as large.
+#: Accuracy to which effective signals are met (a DAC step is three hundred times as large), and most Newton rounds.
 TOLERANCE = 1e-7
 ROUNDS_MAX = 60
-#: Most iterations where elements follow the signals; effective signals may be off by LAG_LEFT then, 1/3 DAC step.
+#: Most iterations if creep elements follow the signals; error of effective signals that ends them, 1/3 DAC step.
 LAG_ROUNDS, LAG_LEFT = 20, 1e-5
 #: Newton's step never divides by a slope below this; laws that can be inverted are steeper by far.
 SLOPE_MIN = 1e-3
 #: Margin of neighbours below their limit: one step of a 16-bit DAC, since each of the two signals is rounded.
 DAC_STEP = 2.0**-15
-#: Most rounds of the programme; it ends earlier at this change of signals, or below this share of the error gained.
+#: Most rounds of the programme; change of signals, and share by which a round reduces the error, below which it ends.
 ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
-#: Weight of changes, relative to the largest gain of the matrix; its factors after a round without and with a gain.
+#: Weight of changes, relative to the largest gain of the matrix; factors on it after a failed and a successful round.
 NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
 #: Half the signal step of the finite differences that give the slope of the law.
 SLOPE_STEP = 1e-4
@@ -56,12 +56,12 @@ class Inverted:
 def invert(
     law: HysteresisModel, state: HysteresisState, effective: Floats, low: float, high: float, ahead: float = 0.0
 ) -> Inverted:
-    """Signals (N,) within `low` .. `high`, applied at the state's time, for `effective` (N,) `ahead` seconds later.
+    """Signals (N,) within `low` .. `high` that, applied at the state's time, give `effective` (N,) `ahead` s later.
 
     The law increases with the signal on every straight move, so each actuator has one solution.
 
     Raises:
-        ValueError: `effective` has another length than the mirror actuators, or is not finite.
+        ValueError: `effective` does not have one value for each actuator, or is not finite.
     """
     if effective.shape != state.signals.shape or not np.isfinite(effective).all():
         raise ValueError(f"effective signals: must be {len(state.signals)} finite numbers")
@@ -79,7 +79,7 @@ def invert(
             break
     if not inverted.missed.any():
         return inverted
-    # A limit may lie before the onset of the piece that holds the solution, so the error is that of the law itself.
+    # A limit may lie before the onset of the piece that holds the solution: the law itself gives what is missed.
     missed = np.where(inverted.missed, wanted - law.position_at(state, inverted.signals), 0.0)
     return Inverted(inverted.signals, missed)
 
@@ -161,7 +161,7 @@ class Pieces:
         return Inverted(signals, np.where(np.abs(gap) <= 2.0 * TOLERANCE, 0.0, -gap))
 
 
-#: A law never changes, so what is derived from it is cached.
+#: Cached, since a law never changes.
 pieces = lru_cache(maxsize=8)(Pieces)
 
 
@@ -176,7 +176,7 @@ class ConstrainedInverse:
     """Finds the nearest commands inside the limits of one mirror.
 
     Args:
-        matrix: (M, N) response per unit of each effective signal, in the rows that are to be met.
+        matrix: (M, N) response to a unit of each effective signal; its M rows are those of the target.
         ridge: weight of the squared effective signals, in the squared unit of `matrix`.
     """
 
@@ -188,7 +188,7 @@ class ConstrainedInverse:
         self._project = orthogonal[: len(matrix)].T
 
     def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> tuple[Floats, Floats]:
-        """The legal command at the state's time whose rows, `ahead` s later, come nearest to `rows` (M,).
+        """The command within the limits, at the state's time, whose response `ahead` s later is nearest to `rows` (M,).
 
         Args:
             start: (N,) signals to begin with, for instance those of the inverse without limits between neighbours.
@@ -232,14 +232,14 @@ class ConstrainedInverse:
         return signals, effective
 
 
-#: Random histories from which the range that is always reachable is found, their moves, and the time between those, s.
+#: Number of random histories that show which range is always reachable, moves of each, and s between moves.
 HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
 
 
 def random_histories(
     law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
 ) -> Iterator[HysteresisState]:
-    """States after random moves between `low` and `high`, in total of at least `histories` actuators."""
+    """States after random moves between `low` and `high`; together they cover at least `histories` actuators."""
     count = law.actuators or histories
     for _ in range(ceil(histories / count)):
         state = law.demagnetised(count, 0.0, 0.5 * (low + high))

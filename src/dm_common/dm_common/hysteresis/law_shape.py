@@ -13,7 +13,7 @@ from dm_common.limits import Limits
 
 #: Points of a branch of a loop.
 STEPS = 81
-#: Number of signals at which slopes are evaluated, and of turning points before them.
+#: Number of signals at which slopes are evaluated, and of turning points from which moves to them begin.
 PLACES = 41
 
 
@@ -34,8 +34,8 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Flo
 
 
 def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:
-    """(2, N, S, R) smallest slope of the Duhem part at `signals` (S,), on falling and rising moves, at least 2 `radius`
-    (R,) after a turn that a full swing led to; infinite where no turn lies so far back.
+    """(2, N, S, R) smallest slope of the Duhem part at `signals` (S,), on falling and rising moves that began, after
+    full swings, with a turn at least 2 `radius` (R,) away; infinite where the range has no room for that.
     """
     count, step = len(signals), signals[1] - signals[0]
     apart = np.minimum((2.0 * radius / step).astype(int), count - 1)
@@ -70,7 +70,7 @@ def normalised(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Hy
 def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
     """Limits on effective signals that signals within `limits` reach whatever the history.
 
-    Hysteresis and creep narrow the range; each end is the least that any of the random histories leaves.
+    Hysteresis and creep narrow the range; each end is the innermost one over random histories.
     """
     if law.is_identity:
         return limits
@@ -86,7 +86,7 @@ def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
 def turned(law: HysteresisModel, turns: Sequence[float], middle: float = 0.0) -> HysteresisState:
     """The state after a degauss that ended at `middle` and straight moves of all actuators to each of `turns`.
 
-    It has as many actuators as have laws of their own, or one.
+    It has one actuator for each law: N if each actuator has its own law, else one.
     """
     state = law.demagnetised(law.actuators or 1, 0.0, middle)
     for turn in turns:
@@ -111,7 +111,7 @@ def closed_cycle(
 ) -> tuple[Floats, Floats, Floats]:
     """Signals (S,) from `low` to `high`, and the static effective signals (S, N) there, rising and falling.
 
-    N is the number of actuators that have laws of their own, or 1.
+    N is the number of laws: that of the actuators if each has its own, else 1.
     """
     state = turned(law, (high, low), 0.5 * (low + high))
     signals, rising, state = branch(law, state, high, steps)

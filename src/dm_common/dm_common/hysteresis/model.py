@@ -1,7 +1,7 @@
 """The law of hysteresis and creep of the actuators, and the state of a mirror under it.
 
 Every actuator follows an *effective signal*; sag and coefficients are linear in it, and the influence function holds
-the gains. Signals are normalised; over a slow full cycle of the run's range the effective signal spans what they span.
+the gains. Signals are normalised; in a slow full cycle over the run's range, effective signals span as much as signals.
 
 * Hysteresis: a sum of polynomials in the values of play operators p_r of half-width r. With first powers only it is
   the Prandtl-Ishlinskii model ([16], section 2.4). Higher powers make it a Preisach operator with a learned density
@@ -10,12 +10,11 @@ the gains. Signals are normalised; over a slow full cycle of the run's range the
 * Optionally Duhem operators (:mod:`~dm_common.hysteresis.duhem`), for hysteresis that fades.
 * Creep: first-order elements, evenly spaced over the logarithm of time, follow the static part. Together they grow by
   `creep_rate` of a step per decade [17, 18]; a spectrum weights them individually. The first elements also follow the
-  signal, with a spectrum of their own: the loops may lag or creep differently from the straight part, so that they are
-  wider for fast moves. The size of creep may change linearly over the range.
+  signal, with a spectrum of their own: loops may lag or creep differently from the straight part and thus be wider for
+  fast moves. The size of creep may change linearly over the range.
 
-The weights are common to all actuators, or each actuator has its own.
-
-The result does not depend on how a straight move is divided into steps, so only turning points have to be known.
+The weights are common to all actuators, or each actuator has its own. The result does not depend on how a straight move
+is divided into steps, so only turning points have to be known.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis, horner
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
-#: Largest creep per decade of time that a law may have.
+#: Largest creep that a law may have, as a share of a step per decade of time.
 CREEP_RATE_MAX = 0.2
-#: Assumed ratio of the errors of requests to those of the held-out moves of the calibration. These follow each other
-#: within seconds; requests are held for longer and err 1.2 to 2.6 times as much.
+#: Assumed ratio of the errors of requests to those of held-out moves of the calibration. Held-out moves follow each
+#: other within seconds; requests are held for longer, and their errors are 1.2 to 2.6 times as large.
 IN_USE = 1.4
 
 
 @dataclass(frozen=True, eq=False)
 class HysteresisState:
-    """State of the actuators, including all they remember. Never changed in place.
+    """State of the actuators, with their memory of past signals. Never changed in place.
 
     Attributes:
         time: s, of the clock that commands are stamped with.
@@ -48,7 +47,7 @@ class HysteresisState:
         fading: (N, Z) of the Duhem operators.
         position: (N,) static effective signal: hysteresis without creep.
         crept: (N, J) states of the creep elements: static effective signals, low-pass filtered.
-        crept_sigma: (J,) its standard deviation, relative to a shape of the whole range; 0 if none was held unobserved.
+        crept_sigma: (J,) standard deviation of `crept`, as a share of a full-range shape; 0 if all was observed.
         lagged: (N, L) states of the elements that follow the signals: signals, low-pass filtered.
     """
 
@@ -76,10 +75,10 @@ class HysteresisModel:
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
         creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
-        crept_at, crept: time, s, and (N,) effective signals that the actuators had crept to by then, just before the
-            maps of the calibration: its figure is relative to that state. Empty = not known.
-        creep_covariance: (2, 1 + J, 1 + J) of the errors of the weights of `position` and of the creep elements: first
-            those common to all actuators, then those of each by itself. Empty = not known.
+        crept_at, crept: time (s) just before the maps of the calibration, and (N,) effective signals to which the
+            actuators had crept by then: the figure is relative to that state. Empty = not known.
+        creep_covariance: (2, 1 + J, 1 + J) of the errors in the weights of `position` and of the creep elements: first
+            of errors common to all actuators, then of errors of each one. Empty = not known.
         lag_spectrum: (L,) or (N, L) weight of each of the first L elements in following the signal, relative to an even
             spectrum; empty = none.
         creep_slope: relative change of creep per unit of `position`.
@@ -202,13 +201,13 @@ class HysteresisModel:
         return HysteresisState(time, signals, play, fading, position, crept, np.zeros(elements), lagged)
 
     def degaussed(self, state: HysteresisState, time: float, middle: float = 0.0) -> HysteresisState:
-        """The state after a degauss that ended at `middle`; creep still remembers what was before."""
+        """The state after a degauss that ended at `middle`; creep still remembers earlier shapes."""
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
         return replace(fresh, crept=waited.crept, crept_sigma=waited.crept_sigma, lagged=waited.lagged)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:
-        """The same signals at a later time (s). A time before the state's is taken as the state's."""
+        """The state at a later time (s), with the signals unchanged. An earlier time changes nothing."""
         elapsed = time - state.time
         if not elapsed > 0.0:
             return state
@@ -235,7 +234,7 @@ class HysteresisModel:
         return np.asarray((1.0 + self.creep_slope * state.position) * creep)
 
     def creep_ahead(self, state: HysteresisState, ahead: float) -> tuple[Floats, Floats, Floats]:
-        """Remainder of present creep after `ahead` s, and the weights of static effective signals and signals then."""
+        """Creep after `ahead` s: remainder of the present creep, weights of static effective signals and of signals."""
         rest = np.exp(-ahead / self.creep_time)
         lag_rest = rest[: self.lag_spectrum.shape[-1]]
         faded = (self.creep_share * state.crept) @ rest + (self.lag_share * state.lagged) @ lag_rest

@@ -1,7 +1,7 @@
 """Follows the hysteresis state of the actuators through the signals that the driver reports as applied.
 
-Only reports change the state, planning never does. So a command that was refused, lost, cut short or sent by another
-client leaves no wrong state behind.
+Only reports change the state; planning never does. So commands that were refused, lost, cut short or sent by another
+client cannot make it wrong.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class HysteresisTracker:
         self._follow(report, last)
 
     def _guess_keeping_creep(self, report: Applied, reason: str, since: float) -> None:
-        """The position is known, but not the branch of the loop; what was held since `since` (s) is in doubt."""
+        """The position is known, but neither the branch of the loop nor the shapes held since `since` (s)."""
         assert self.state is not None
         state = self.law.move(self.state, report.signals, report.time)
         sigma = held_unseen(self.law, state.crept_sigma, report.time - since)
@@ -153,7 +153,7 @@ class Observed(NamedTuple):
 
 
 class HysteresisObserver:
-    """Follows one mirror under the law in use. May be asked from any thread, but not while the law is exchanged.
+    """Follows one mirror under the law in use. Thread-safe, except while `use` exchanges the law.
 
     Attributes:
         law: the law that is followed; the linear one where no hysteresis was identified.
@@ -172,7 +172,7 @@ class HysteresisObserver:
         self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
 
     def use(self, law: HysteresisModel, middle: float, identified: bool = True) -> None:
-        """Follow another law, a placeholder unless `identified`, through all reports; degausses end at `middle`."""
+        """Follow `law` through all reports so far; degausses end at `middle`. Not `identified`: a placeholder."""
         with self._lock:
             self._identified = identified
             same = law.same_as(self.law) and middle == self._middle
@@ -181,7 +181,7 @@ class HysteresisObserver:
                 self.recall(self._record)
 
     def recall(self, record: CreepRecord | None, another: bool = False) -> None:
-        """Follow all reports again, from the creep of `record`; of `another` mirror, forget the reports instead."""
+        """Follow all reports again, from the creep of `record`; for `another` mirror, forget the reports instead."""
         with self._lock:
             self._record = record
             if another:
@@ -206,7 +206,7 @@ class HysteresisObserver:
         """Take the driver's next report; one without signals (the driver knows none yet) only becomes the latest.
 
         Args:
-            doubtful: s before it that the clock may have skipped: the shape counts as held unobserved for as long.
+            doubtful: s before it that the clock may have skipped; the shape counts as unobserved for that long.
 
         Raises:
             ValueError: another number of actuators, or values that are not finite; the observer begins anew.
@@ -223,7 +223,7 @@ class HysteresisObserver:
         if self._log and _same(self._log[-1], report):
             self._log[-1] = self._tracker.last = report
             return
-        # A later law needs the turning points, and how a move under way began.
+        # A law that is identified later needs the turning points, and the beginning of a move under way.
         if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
             self._log.pop()
         self._log.append(report)
@@ -275,7 +275,7 @@ class HysteresisObserver:
         return ActuatorEstimate(state, unknown)
 
     def recent(self) -> list[Observed]:
-        """The latest reports, in the order they came, with what follows from each."""
+        """The latest reports in the order received, each with the estimate that follows from it."""
         with self._lock:
             return list(self._observed)
 

@@ -17,7 +17,7 @@ _ANGLES = 48
 def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0) -> Floats:
     """Sag of a conic, m, Eq. (2); positive curvature is concave (the rim stands above the vertex).
 
-    The equation's form with the root in the denominator loses no digits for weak curvatures.
+    In this form, with the root in the denominator, the equation loses no digits for weak curvatures.
 
     Args:
         x, y: m, of any one shape, which the result has too.
@@ -54,14 +54,14 @@ def conic_coefficients(curvature: float, conic_constant: float, radius: float) -
 
 
 def disc_coefficients(sag: Callable[[Floats, Floats], Floats]) -> Floats:
-    """(..., 21) Born & Wolf coefficients of `sag`, from points (Q,) of the unit disc to (..., Q), by least squares."""
+    """(..., 21) Born & Wolf coefficients of `sag`, a function of x, y (Q,) on the unit disc that returns (..., Q)."""
     x, y, projection = _quadrature()
     return sag(x, y) @ projection
 
 
 @cache
 def _quadrature() -> tuple[Floats, Floats, Floats]:
-    """Points of the unit disc, x and y (Q,), and what takes sag there to coefficients, (Q, 21)."""
+    """Points of the unit disc, x and y (Q,), and the matrix (Q, 21) that turns sag there into coefficients."""
     nodes, weights = np.polynomial.legendre.leggauss(_RADIAL_NODES)
     r = np.sqrt((nodes + 1) / 2)
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
@@ -73,7 +73,7 @@ def _quadrature() -> tuple[Floats, Floats, Floats]:
 def pitch_of_sphere(
     coefficients: ArrayLike, radius_px: float, pitch: float, radius_of_curvature: float
 ) -> tuple[float, float]:
-    """The lateral resolution (m per pixel) at which a map shows a sphere of known radius.
+    """The lateral resolution (m per pixel) of a map that shows a sphere of known radius.
 
     The defocus of a sphere is proportional to the square of the aperture radius, so heights give lengths.
 
@@ -108,8 +108,8 @@ def reachable_range(reached: Callable[[float], bool], middle: float, stroke: flo
     """Smallest and largest curvature (1/m) that a mirror reaches; (nan, nan) if neither 0 nor `middle` is reached.
 
     Args:
-        reached: whether it reaches a curvature; by convexity, those it reaches form one interval.
-        middle: curvature in mid range: a mirror that is only pulled does not reach 0.
+        reached: whether the mirror reaches a curvature; by convexity, the reachable ones form one interval.
+        middle: curvature at mid range, where the search starts if 0 is not reached (a mirror that is only pulled).
         stroke: largest change of curvature by all actuators together, 1/m.
         step: accuracy of the ends, 1/m.
     """

@@ -1,4 +1,4 @@
-"""Piston and tilt, which come from the interferometer's alignment: of maps, and of sag at the sampling points."""
+"""Fit and removal of piston and tilt, which depend on the interferometer's alignment, in maps and in sag samples."""
 
 import numpy as np
 

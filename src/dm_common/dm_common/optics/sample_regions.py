@@ -1,11 +1,10 @@
 """Concentric regions on sampling points instead of pixels, for stored maps that hold the sag at some hundred points.
 
-A point represents a share of the aperture's area (its weight), not a place without extent. With some ten rings of
-points and ten regions, counting a whole ring in or out would put the boundary of a region off by half a ring's width,
-up to 7 % of the area. So the boundary cuts through the points' shares. Points are taken from the centre outwards; those
-of one radius together represent the annulus between the area of all points inside them and that area plus their own. A
-disc of a given area holds of each point the part of that annulus that lies inside. For rings of edge-clustered points
-this is exact, as it is for uniform points, whose weights are equal.
+A point represents a share of the aperture's area (its weight). There are some ten rings of points for ten regions: to
+count whole rings in or out would shift the boundary of a region by up to half a ring's width, or 7 % of the area. So
+boundaries cut through the points' areas. The points of one radius together represent an annulus, which begins where the
+area of all points further inside ends. A disc contains of each point the part of its annulus inside the disc. This is
+exact for rings of edge-clustered points, and for uniform points, whose weights are equal.
 """
 
 from collections.abc import Sequence
@@ -89,12 +88,12 @@ def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) 
 
 
 def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
-    """(P,) weight of each point: that of the ring it lies in.
+    """(P,) weight of each point: that of the smallest region that contains it.
 
     Where the boundary of a region cuts through a point's area, squared weights are averaged, since weights act squared.
 
     Args:
-        weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
+        weights: (R,) of the regions, from the innermost; their areas grow in R equal steps to the whole aperture.
 
     Raises:
         ValueError: weights not above 0, or not one per region.
@@ -109,10 +108,10 @@ def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
 
 
 def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
-    """Place (b) of `dm_calibration.influence.weights`: row factors of the command solve min |W(dC - G dS)|.
+    """Row factors W of the command solve min |W(dC - G dS)|: place (b) of `dm_calibration.influence.weights`.
 
-    On the vector of sag points, multiply the rows of the influence function (P, N) and of the wanted sag (P,) by them.
-    They include the points' areas; their squares sum to 1 as the areas do: a ridge weighs as without weights.
+    Multiply the rows of the influence function (P, N) in sag and of the wanted sag (P,) by them. They include the
+    points' areas; their squares sum to 1, as the areas do, so a ridge has the same effect as without weights.
 
     Args:
         weights: (R,) of the regions.

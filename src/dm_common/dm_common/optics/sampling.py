@@ -33,8 +33,8 @@ class SamplePoints:
 def edge_clustered_points(count: int = 500) -> SamplePoints:
     """Points that crowd towards the rim as Chebyshev nodes do, which suppresses ringing of polynomial fits there.
 
-    Rings at r = sin(pi/2 (k - 1/2)/K) lie between circles at sin(pi/2 k/K); each ring has points in proportion to its
-    circumference, and shares out the area between its two circles. Deterministic. After [5].
+    Rings at r = sin(pi/2 (k - 1/2)/K) lie between circles at sin(pi/2 k/K). The number of points of a ring is
+    proportional to its circumference; they share the area between its two circles. Deterministic. After [5].
 
     Raises:
         ValueError: count below 8.
@@ -62,9 +62,9 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
 def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: float, points: SamplePoints) -> Floats:
     """Read a map at the sampling points by the four-neighbour rule of section 2.2: (P,), in the unit of the sag.
 
-    A point on a pixel takes its value; a point on the line between two adjacent pixels the mean of the two; any other
-    the mean of its four neighbours. Neighbours without data or beyond the map's border do not count; when none is left,
-    the result is NaN.
+    A point on a pixel takes the pixel's value; a point on the line between two adjacent pixels, the mean of the two;
+    any other point, the mean of its four neighbours. Neighbours without data or beyond the map's border do not count;
+    when none is left, the result is NaN.
 
     Args:
         sag: (height, width), row 0 = top, NaN = no data.

@@ -17,7 +17,7 @@ MAX_ORDER = 5
 
 #: Number of leading terms that no interferometer can attribute to the mirror: piston and the two tilts.
 PISTON_TILT = 3
-#: Number of even powers (from 0 on) of an actuator's distance from the centre that describe the tilt it makes.
+#: Number of even powers (0, 2, ...) of an actuator's distance from the centre that describe the tilt it makes.
 TILT_ORDERS = 3
 
 
@@ -128,8 +128,8 @@ def curvature_of_defocus(coefficient: float, radius: float) -> float:
 
 
 def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
-    """Rms sag over the aperture without piston and tilt, m, of coefficients (21,), m, and of a `residual` of this rms,
-    m, that the terms do not describe.
+    """Rms sag over the aperture without piston and tilt, m: of coefficients (21,), m, together with the part of the
+    surface that the terms do not describe, of rms `residual`, m.
     """
     return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
 
@@ -168,10 +168,10 @@ def to_born_wolf(coefficients: ArrayLike, convention: str) -> Floats:
 def tilt_influence(measured: Floats, places: Floats, response: Floats) -> Floats:
     """The tilt that each actuator makes, (2, N) m per unit signal, from maps that include the instrument's own tilt.
 
-    The instrument is aligned differently in each map: 0.3 um at the edge leave an error of 0.12 um per unit signal from
-    159 maps. The positions of the actuators and their responses are known far better. An actuator tilts the plate
-    towards itself, by a smooth function of its distance from the centre times its response. The few coefficients of
-    this function are fitted to the tilts in all maps. A sphere needs them only where its command is not symmetric.
+    The instrument is aligned differently in each map: with 0.3 um of tilt at the edge, 159 maps leave an error of 0.12
+    um per unit signal. The positions of the actuators and their responses are known far better. An actuator tilts the
+    plate towards itself, by its response times a smooth function of its distance from the centre. The few coefficients
+    of this function are fitted to the tilts in all maps. For spheres, tilts matter only if a command is not symmetric.
 
     Args:
         measured: (2, N) m per unit signal, as found from the maps.

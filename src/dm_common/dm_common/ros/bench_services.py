@@ -1,4 +1,4 @@
-"""The calibration's bench over ROS: the driver's and the interferometer's services as blocking calls."""
+"""The bench of a calibration over ROS: services of driver and interferometer as blocking calls."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from dm_common.ros.worker import sleep
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
 
-#: Failures of a measurement that another try cannot cure.
+#: Error codes of a failed measurement that another try cannot cure.
 _FATAL = (ErrorCode.INTERFEROMETER_INACTIVE, ErrorCode.NOT_SUPPORTED, ErrorCode.INVALID_ARGUMENT)
-#: Signals that differ less are the same command.
+#: Signals that differ by no more than this are the same command.
 _SAME_SIGNAL = 1e-6
-#: Tries of one map, if the interferometer is lost in each and comes back.
+#: Most tries of one map, if the interferometer is lost during each of them and comes back.
 _TRIES = 5
 #: Wall time for a state message to confirm that the mirror still holds the command, s (it comes every 0.5 s).
 _STATE_WAIT_S = 2.0
@@ -53,7 +53,7 @@ class BenchServices:
         settle_time: s of ROS time between command and map.
         cancelled: whether to cancel; called while waiting.
         map_time: s of ROS time that the last map took; 0 = none was taken yet.
-        waiting: called with what is waited for, such as a missing node; "" = the wait is over.
+        waiting: called with the reason for waiting, such as a missing node; "" = the wait is over.
         temperature: of the mirror (degC) at a time (s of ROS time); NaN = not known.
     """
 
@@ -83,7 +83,7 @@ class BenchServices:
         self._driver.heard()
 
     def publish_waits(self, handle: Any, feedback: Any) -> None:
-        """From now on, publish what is waited for as the `message` of the feedback of a goal."""
+        """From now on, publish the reason for waiting as the `message` of a goal's feedback."""
 
         def publish(text: str) -> None:
             feedback.message = text
@@ -94,7 +94,7 @@ class BenchServices:
 
     @contextmanager
     def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
-        """Hold the mirror for the block: commands of others are refused.
+        """Hold the mirror during the block: commands of other clients are refused.
 
         Arguments as those of `MirrorHolder.held`.
 
@@ -115,8 +115,8 @@ class BenchServices:
     def check_history(self) -> None:
         """Raise Refusal when the driver knew the history of the actuators and no longer does.
 
-        A driver that was restarted, or lost its link, soon takes commands again; but what was measured before and after
-        does not belong together without a degauss in between.
+        A driver that was restarted, or lost its link, soon takes commands again; but maps from before and after that
+        must not be combined without a degauss in between.
         """
         was_known = self._history_known
         self._history_known = self.state is not None and self.state.history_known
@@ -185,7 +185,7 @@ class BenchServices:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
         began = self._node.get_clock().now()
-        # The interferometer keeps the time limit; the call waits a little longer for its answer, which has the reason.
+        # The interferometer enforces the time limit; the call waits a little longer for its answer with the reason.
         try:
             with self._answered("measure", self._interferometer, self._measure.service_is_ready) as stop:
                 response = call(self._measure, request, timeout + 5.0, stop)
@@ -205,7 +205,7 @@ class BenchServices:
             raise Refusal(ErrorCode.INTERNAL, f"measure: {error}") from error
 
     def rest(self, signals: Floats) -> str:
-        """Ramp back to `signals`, even after a cancel. Returns the outcome as a sentence."""
+        """Ramp back to `signals`, even after a cancellation. Returns the outcome as a sentence."""
         self.cancelled = lambda: False
         self._history_known = False
         deadline = time.monotonic() + self._values["degauss_timeout"]
@@ -252,7 +252,7 @@ class BenchServices:
         return self._interferometer.text if self._no_interferometer() else ""
 
     def _stopping(self) -> bool:
-        """Whether a wait is to end. Anything missing meanwhile, needed now or later, is reported at once."""
+        """Whether a wait is to end. Anything missing on the bench is reported at once, even if needed only later."""
         if (missing := self._missing()) != self._said:
             self._said = missing
             self.waiting(f"waiting: {missing}" if missing else "")
@@ -260,13 +260,13 @@ class BenchServices:
 
     @contextmanager
     def _answered(self, what: str, server: qos.Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
-        """Give a call of `what` at `server` a condition that ends its wait, and turn its failure into a Refusal."""
+        """For a call of `what` at `server`: yield the condition that ends its wait; turn its failure into a Refusal."""
         server.wait_for_return(self._stopping)
         gone = server.since_now(ready)
         try:
             yield lambda: self._stopping() or bool(gone())
         except ServiceCallError as error:
-            if self.cancelled() or not self._node.context.ok():  # else the journal would hold a map that failed
+            if self.cancelled() or not self._node.context.ok():  # a Refusal would be journalled as a failed map
                 raise Cancelled("cancelled") from error
             if self.hold.lost is not None:
                 raise self.hold.lost from error

@@ -15,10 +15,10 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 
-#: How often a hold is renewed, s: several times within the lease of 3 s. Longest wait for its release, s, after
-#: which it ends with its lease.
+#: Interval between renewals of a hold, s: several within the lease of 3 s. Longest wait for its release, s; without an
+#: answer the hold ends with its lease.
 RENEW_S, RELEASE_S = 0.7, 1.0
-#: Longest wait for the end of a cancelled goal; time for a cancel to go out where no answer can come any more, s.
+#: Longest wait for the end of a cancelled goal, s; time for a cancel request to be sent to a server that is gone, s.
 CANCEL_S, SEND_S = 20.0, 0.5
 
 
@@ -26,7 +26,7 @@ class ServiceCallError(Exception):
     """A service or action did not answer: not there, too slow, or the wait was cancelled.
 
     Attributes:
-        error_code: for callers that serve others; TIMEOUT unless there is another reason.
+        error_code: for callers that pass it on; TIMEOUT unless there is another reason.
     """
 
     def __init__(self, message: str, error_code: int = ErrorCode.TIMEOUT) -> None:
@@ -47,7 +47,7 @@ def call(
 
     Args:
         timeout_s: longest wait for the server, and for its answer.
-        again_s: an unanswered request is sent again after this time, once; only for one that may be carried out twice.
+        again_s: s after which an unanswered request is sent once more; only for requests that may be executed twice.
         send_by: called with a function that sends the request; returns what that function returns.
         ready_s: longest wait for the server, if shorter than `timeout_s`.
 
@@ -126,14 +126,14 @@ def run_goal(
     identity: Any = None,
     send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
-    """Run a goal from a worker thread and return its result; if given up, cancel it first (Ctrl-C reports its end).
+    """Run a goal from a worker thread, return its result. A failed wait, or Ctrl-C (which reports its end), cancels it.
 
     Args:
-        timeout_s: longest wait for the end.
-        answer_s: longest wait for the server, and for its answer to the goal; None = `timeout_s`.
+        timeout_s: longest wait for the end of the goal, s.
+        answer_s: longest wait for the server, and for its answer to the goal, s; None = `timeout_s`.
         on_feedback: called by the executor.
-        stop: cancels the goal; its result is still waited for and returned.
-        gone: whether the server is known to be gone; it is then not waited for.
+        stop: becomes true to cancel the goal; its result is still awaited and returned.
+        gone: whether the server is known to be gone; the wait for it then ends.
         identity: of the goal, a unique_identifier_msgs/UUID; None = any.
         send_by: called with a function that sends the goal; returns what that function returns.
 
@@ -184,7 +184,7 @@ class MirrorHolder:
     A restarted driver receives the renewal too, so that the hold survives the restart.
 
     Args:
-        gone: whether the driver is known to be gone; the release of a hold is then not waited for.
+        gone: whether the driver is known to be gone; the wait for the release of a hold then ends.
 
     Attributes:
         holder: name of the holder, sent with every command as well.
@@ -212,12 +212,12 @@ class MirrorHolder:
         timeout_s: float,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Iterator[None]:
-        """Hold the mirror for the block.
+        """Hold the mirror during the block.
 
         Args:
-            asked: the goal or request to do so. If its `holder` has the mirror already, that hold is used: it is
-                neither renewed nor released here. Its `take_over` ends the hold of anybody else.
-            purpose: what it is for and how to end it, for clients that are refused meanwhile.
+            asked: the goal or request that needs the mirror. If its `holder` has the mirror already, that hold is used,
+                and neither renewed nor released here. Its `take_over` ends the hold of anybody else.
+            purpose: of the hold, and how to end it, for clients that are refused meanwhile.
             duration: expected duration, s; 0 = not known.
             timeout_s: longest wait for the driver.
             cancelled: ends that wait.
@@ -253,10 +253,10 @@ class MirrorHolder:
             self._one.release()
 
     def wait_for(self, free: Callable[[], bool], asked: Any, busy: str, timeout_s: float) -> None:
-        """Wait until `free()`, if `asked` takes the mirror over from another run of this node; that run loses it.
+        """Wait until `free()` if the request `asked` takes the mirror over from another run of this node, ending that.
 
         Raises:
-            Refusal: BUSY with the sentence `busy`: `asked` does not take over, or the run does not end in time.
+            Refusal: BUSY with the sentence `busy`, if `asked` does not take over, or the run does not end in time.
         """
         deadline = time.monotonic() + timeout_s
         while not free():
@@ -273,7 +273,7 @@ class MirrorHolder:
             return send()
 
     def end(self) -> bool:
-        """Note that the process ends: no run sends a command from now on. Returns whether a run has the mirror."""
+        """Note that the process ends: no run sends a command from now on. Returns whether a run holds the mirror."""
         with self._sending:
             self._ended = True
             return self._one.locked()

@@ -1,4 +1,4 @@
-"""ROS domains for runs that must not meet others on the same machine, and which process holds a file or a port."""
+"""ROS domains that isolate runs on one machine from each other, and which process holds a file or a port."""
 
 import contextlib
 import fcntl
@@ -53,7 +53,7 @@ def held_by(port: int) -> str:
 def own_domain() -> Iterator[int]:
     """Lend a ROS domain that no other demo or test on this machine uses at the same time.
 
-    Domains with leftover nodes are skipped too: nodes of a killed run go on, while its lock ended with it.
+    Domains with leftover nodes are skipped too: a killed run loses its lock, but its nodes may live on.
     """
     folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
     folder.mkdir(exist_ok=True)

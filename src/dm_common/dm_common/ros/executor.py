@@ -5,7 +5,7 @@ with care (measured with rclpy 7.1.6):
 
 * `spin()` without a time limit never dispatches in the PyPI wheels; `spin_once(timeout_sec=...)` in a loop does.
 * An exception in a callback leaves `spin_once` and with it the rest of the batch: messages that arrived together with
-  the one that raised would wait for the next event, and every later one would be late by one.
+  the one that raised would wait for the next event, and all later ones would be delivered one event late.
 * `async def` service callbacks are not run, and a pending `await` in an action callback is polled at 100 % CPU. Work
   that waits therefore runs in worker threads (see :mod:`dm_common.ros.worker`), and callbacks stay short.
 * It keeps a reference to every entity it serves: a node destroyed before its executor is shut down stays in the
@@ -72,7 +72,7 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
     for node in executor.get_nodes():
         getattr(node, "autostart", lambda: None)()
         for service in node.services:
-            if "send_response" not in vars(service):  # else it only hands the request on, see `worker.WorkerService`
+            if "send_response" not in vars(service):  # a `worker.WorkerService` has replaced it and sends by itself
                 service.send_response = until_discovered(service.send_response)
     while context.ok() and not until():
         try:
@@ -180,7 +180,7 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
 
     Returns the exit status: 0, or 1 when the node could not be made (the reason is on standard error).
     """
-    # Until the executor takes them over, both end the process as Ctrl-C does; a shell's background job ignores SIGINT.
+    # Until `StopOnSignals`, both raise KeyboardInterrupt; a background job of a shell would otherwise ignore SIGINT.
     for number in STOPPING:
         signal.signal(number, signal.default_int_handler)
     node: Node | None = None
@@ -201,7 +201,7 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
         executor = make_executor(node)
         signals = StopOnSignals(executor)
         stall.watch()
-        # Keep what exists now: a full collection through all modules would stall the node for 30 to 50 ms.
+        # Exempt all present objects: a full garbage collection through all modules would stall the node by 30 to 50 ms.
         gc.collect()
         gc.freeze()
         supervisor = os.environ.get(SUPERVISOR)
@@ -235,7 +235,7 @@ def until_discovered(send: Callable[..., None]) -> Callable[..., None]:
 
 
 class PatientActionServer(ActionServer):
-    """An action server that accepts every goal, and repeats acceptance and result when they were dropped."""
+    """An action server that accepts every goal, and sends acceptance and result again when they were dropped."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         self._judged = self._begun = 0.0

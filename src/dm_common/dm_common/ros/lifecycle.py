@@ -58,7 +58,7 @@ class ManagedNode(LifecycleNode):
     """A lifecycle node that configures and activates itself, unless its parameter `autostart` is false.
 
     Subclasses define the transitions in `configure`, `activate`, `deactivate` and `clean_up`. The first two raise
-    ValueError if the parameters are not acceptable: the node then stays as it was, says why, and accepts other values.
+    ValueError if the parameters are not acceptable: the node then keeps its state, says why, and accepts other values.
 
     Args:
         name, keywords: of the node.
@@ -87,7 +87,7 @@ class ManagedNode(LifecycleNode):
         self.configured = self.active = False
         self.session = 0
         self._trouble = ""
-        self._made: Mapping[str, Any] | None = None  # the parameters that `configure` was called for
+        self._made: Mapping[str, Any] | None = None  # parameters of the last `configure`
         self._unlock = "deactivate" if self.rests else "cleanup"
         self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
         self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
@@ -98,13 +98,13 @@ class ManagedNode(LifecycleNode):
     # --- what nodes do ---
 
     def configure(self) -> None:
-        """Set up what the parameters ask for; if the node `rests`, again before an activation if they changed."""
+        """Set up the node from its parameters; if it `rests`, again before an activation when they have changed."""
 
     def activate(self) -> None:
         """Begin to work."""
 
     def deactivate(self) -> None:
-        """Rest. Goals end as when they are cancelled."""
+        """Stop working. Goals end as if they were cancelled."""
 
     def clean_up(self) -> None:
         """Return to the state after the start."""
@@ -113,7 +113,7 @@ class ManagedNode(LifecycleNode):
         """Called with the reason when the parameters are not acceptable."""
 
     def health(self) -> Health:
-        """Health of the node; if it `rests`, only asked for while it is active."""
+        """Health of the node; if it `rests`, called only while it is active."""
         return Health()
 
     # --- what all have in common ---
@@ -129,7 +129,7 @@ class ManagedNode(LifecycleNode):
         return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"
 
     def check_active(self) -> None:
-        """Raise Refusal when the node rests."""
+        """Raise Refusal if the node `rests` and is not active."""
         if self.rests and (reason := self.inactive()):
             raise Refusal(ErrorCode.NODE_INACTIVE, reason)
 
@@ -160,7 +160,7 @@ class ManagedNode(LifecycleNode):
         return answer
 
     def _done(self, *steps: Callable[[], None]) -> TransitionCallbackReturn:
-        """Take the steps of a transition and log what they raise, which rclpy does not do."""
+        """Take the steps of a transition and log their exceptions, which rclpy does not do."""
         try:
             for step in steps:
                 step()

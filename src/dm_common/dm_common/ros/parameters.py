@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter as RosParameter
 from dm_common.errors import Refusal, unknown_name
 from dm_common.values import Value, switch
 
-#: By the type of a value, or of the elements of an array, and whether it is one.
+#: ROS types, by the Python type of a value or of an array's elements, and whether it is an array.
 _TYPES = {
     (bool, False): RosParameter.Type.BOOL,
     (int, False): RosParameter.Type.INTEGER,
@@ -70,10 +70,10 @@ class Parameter:
         return described
 
     def check(self, given: Any) -> Any:
-        """The value of the parameter for `given`; where a float is wanted, a whole number is accepted.
+        """The value of the parameter for `given`; a whole number is accepted for a float.
 
         Raises:
-            ParameterError: it is not allowed.
+            ParameterError: the value is not allowed.
         """
         value = self.value
         many = isinstance(given, list | tuple | array)
@@ -169,13 +169,13 @@ def declare(
 ) -> Values:
     """Declare every parameter of `table` on `node` and return their values by name.
 
-    Every set is checked; accepted changes are put into what is returned, then given to `on_change`.
+    Every change is checked; accepted changes are entered in the returned values, then passed to `on_change`.
 
     Args:
         unlocked: for a lifecycle node: whether parameters that are not live may change now. If given, nothing is raised
-            here: the node calls `Values.check` when it is configured, and errors can be corrected before.
+            here: the node calls `Values.check` when it is configured, and errors can be corrected before that.
         unlock: transition after which they may change.
-        check: raises ValueError for changes that contradict what the node has learnt since.
+        check: raises ValueError for changes that contradict what the node has learnt meanwhile.
 
     Raises:
         ParameterError: naming every parameter that is missing, wrong or unknown.
@@ -281,7 +281,7 @@ def _numbers(value: Value, given: Any) -> Any:
 
 
 def _judge_unknown(node: Node, name: str, known: Mapping[str, Parameter], values: Values) -> None:
-    """Judge a parameter that is given but not declared: refuse one that can only be meant for this node, else warn.
+    """Judge a given parameter that is not declared: refuse one that can only be meant for this node, else warn.
 
     A file for all nodes (`/**:`) may contain parameters that are meant for others.
     """

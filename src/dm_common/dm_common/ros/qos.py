@@ -1,8 +1,8 @@
-"""Quality-of-service profiles, one per kind of topic, and a watch on whether a node that one depends on is alive.
+"""Quality-of-service profiles, one per kind of topic, and a watch on whether another node is alive.
 
 A service of a killed process stays in the ROS graph for 20 s, and its clients keep waiting. DDS asserts liveliness for
-every publisher with a lease, whatever it publishes. So each node that others wait for publishes one topic with a lease,
-and those who wait watch it here: they know within a second, also after kill -9.
+every publisher with a lease, whether it publishes or not. So each node that others wait for has one publisher with a
+lease, which its clients watch by this module: they learn of its death within a second, even after kill -9.
 """
 
 import time
@@ -39,8 +39,8 @@ LEASE_S = 1.0
 SURE_S = 0.7
 #: A node that has not appeared for this time after the start of the node that watches it is missing, s.
 APPEAR_S = 5.0
-#: A restarted node is discovered by some processes sooner than by others, seconds apart on a busy machine: a call to a
-#: node that is lost waits for this time before the node counts as dead, s.
+#: A call to a node that is lost waits for its return for this time, s: some processes discover a restarted node later
+#: than others, by seconds on a busy machine.
 RETURN_S = 1.2
 #: Text on a node that is lost.
 GONE = "has died, was stopped or hangs: start it again"
@@ -55,16 +55,16 @@ def with_lease(profile: QoSProfile) -> QoSProfile:
 
 
 class Liveliness:
-    """Watches the publisher of a topic by a subscription of its own, whose messages it does not even decode.
+    """Watches the publisher of a topic by a subscription of its own, whose messages are not decoded.
 
     Made by `watch`: with two such subscriptions in one process, Fast DDS counts a living publisher as dead when it
     forgets one that was killed, 20 s later (measured; the first of them is given the state of whichever publisher
     `LivelinessManager::remove_writer` passed last).
 
-    A publisher without a lease is not seen at all: nothing is known of it.
+    A publisher without a lease is not seen at all.
 
     Args:
-        message_type, topic: one that is published seldom.
+        message_type, topic: of a topic with few messages.
         profile: of the topic, without the lease.
 
     Attributes:
@@ -101,7 +101,7 @@ class Liveliness:
             time.sleep(0.02)
 
     def missing(self, served: Callable[[], bool] = lambda: True) -> bool:
-        """Whether the node is lost, or never appeared and does not serve what `served` looks for.
+        """Whether the node is lost, or never appeared and `served()` finds none of its services.
 
         Without `served`, a node that never appeared is not missing.
         """
@@ -135,8 +135,8 @@ class Liveliness:
 
     def _on_change(self, info: Any) -> None:
         lost = info.alive_count == 0
-        # A publisher that returns after its lease lapsed only leaves the count of those not alive. If the first one
-        # came before the executor, its arrival may go unnoticed; any later change shows that there was one.
+        # A publisher that returns after its lease lapsed moves from one count to the other: their sum does not grow. If
+        # the first one came before the executor, its arrival may go unnoticed; any later change shows that it came.
         started = info.alive_count_change + info.not_alive_count_change > 0
         self.starts = max(self.starts + started, 1)
         if lost != self.lost:

@@ -1,4 +1,4 @@
-"""Fast DDS and the shared memory of this machine: which processes use it, and what killed ones leave there."""
+"""Shared memory of Fast DDS: which processes use it, and removal of the segments that killed processes leave."""
 
 import fcntl
 import os
@@ -17,11 +17,11 @@ SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 
 
 def use_udp_alone() -> None:
-    """Keep this process from using shared memory, by one of the profiles for that beside the one of the suite.
+    """Keep this process from using shared memory: select a UDP profile from the folder of the suite's profile.
 
-    To be called before ROS is initialised. With LOCALHOST, rmw_fastrtps would add shared memory to any profile, so a
-    profile that keeps to the machine replaces it. Nothing changes with a profile of the user's own, with another
-    middleware (which only LOCALHOST keeps to the machine), or with peers beside LOCALHOST (heeded only with LOCALHOST).
+    To be called before ROS is initialised. With the range LOCALHOST, rmw_fastrtps would add shared memory to any
+    profile, so a profile that confines UDP to the machine replaces that range. Nothing changes with a profile of the
+    user's own, with another middleware (only LOCALHOST confines it), or with peers beside LOCALHOST (lost without it).
     """
     profile, local = Path(os.environ.get(PROFILE) or "none"), os.environ.get(RANGE) == "LOCALHOST"
     alone = profile.with_name(UDP_LOCAL if local else UDP)
@@ -36,9 +36,9 @@ def use_udp_alone() -> None:
 def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
     """Remove Fast DDS segments whose process is gone.
 
-    Fast DDS removes its segment (17 MB, see config/fastdds.xml of dm_bringup) when a node ends, never after it
-    was killed, and memory runs out after some hundred kills. The owner of the segment `fastrtps_ID` holds a lock on
-    the file `fastrtps_ID_el` as long as it lives. Ports, by number, are taken over by Fast DDS itself.
+    Fast DDS removes its segment (17 MB, see config/fastdds.xml of dm_bringup) when a node ends, but not when it is
+    killed, so memory runs out after some hundred kills. The owner of the segment `fastrtps_ID` holds a lock on the file
+    `fastrtps_ID_el` as long as it lives. Segments of ports, named by number, are taken over by Fast DDS itself.
     """
     for lock in SHARED_MEMORY.glob("fastrtps_*_el"):
         if lock.name.startswith("fastrtps_port"):

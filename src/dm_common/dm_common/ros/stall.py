@@ -1,4 +1,4 @@
-"""Ends a node whose middleware is deadlocked, so that whoever started it starts it again.
+"""Ends a node whose middleware is deadlocked, so that its supervisor can restart it.
 
 Fast DDS 2.14 occasionally deadlocks when a client leaves: the thread that removes the client holds the participant's
 mutex and waits for the thread of timed events, which needs that mutex to assert the node's liveliness
@@ -18,12 +18,12 @@ from rclpy.logging import get_logger
 
 #: The threads of this process, and the prefix of the names of those for timed events.
 TASKS, NAME = Path("/proc/self/task"), "dds.ev."
-#: Pause between two checks, s (wall time), and how many in a row must find such a thread without a new wake-up, after
-#: it has been seen to wake. These threads wake for each lease and at least for every announcement: each second with
-#: config/fastdds.xml of dm_bringup, every three without it. Checks are counted rather than time, so that a stopped
-#: process or a machine that slept continues where it was.
+#: Pause between two checks, s (wall time), and the number of checks in a row without a new wake-up of such a thread,
+#: once seen to wake, that shows a deadlock. These threads wake for each lease and at least for every announcement: each
+#: second with config/fastdds.xml of dm_bringup, every three without it. Checks are counted rather than time, so that a
+#: stopped process or a machine that slept continues where it was.
 LOOK_S, LOOKS = 3.0, 15
-#: Time allowed for the way to the safe shape, s; then the process is cut off, since what follows would never end.
+#: Time allowed for the ramp to the safe shape, s; the kernel then kills the process, which could never end by itself.
 END_S = 15
 
 
@@ -33,7 +33,7 @@ def watch() -> None:
 
 
 def wakes(tasks: Path = TASKS) -> dict[str, int]:
-    """{thread: number of its voluntary waits}, of the threads for timed events; {} with another middleware."""
+    """{thread: number of its voluntary waits} of the threads for timed events; {} with another middleware."""
     found: dict[str, int] = {}
     for task in tasks.iterdir() if tasks.is_dir() else ():
         with suppress(OSError, StopIteration):  # it has just ended
@@ -57,7 +57,7 @@ def _watch(pause: float, stand_still: Callable[[], None], tasks: Path = TASKS) -
 
 def end() -> None:
     """End this process in as orderly a way as possible: the loop ends, the mirror is made safe."""
-    signal.alarm(END_S)  # by the kernel, and first: what is stuck may hold Python's lock, or the log's
+    signal.alarm(END_S)  # by the kernel, and first: the stuck thread may hold Python's lock, or that of the log
     get_logger("dm_common.ros").error(
         "the middleware stands still (eProsima/Fast-DDS#6502): this node ends, and is to be started again"
     )

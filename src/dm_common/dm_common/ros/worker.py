@@ -1,8 +1,7 @@
-"""Worker threads for work that has to wait, beside an executor that never waits.
+"""Worker threads for callbacks that have to wait, beside an executor that never waits.
 
 A service or action callback that would block (settling, files, fits, other services) runs as ordinary code in a worker
-thread; its outcome is handed back to the executor, which sends the response. While it runs, streams are served
-undisturbed and nothing polls.
+thread; the executor gets its outcome and sends the response. Meanwhile topics are served undisturbed, without polling.
 """
 
 import threading
@@ -29,7 +28,7 @@ from dm_common.values import Fields, without_figures
 RESULT_TIMEOUT_S = 10
 #: Longest wait for a simulator's first message on /clock, s.
 CLOCK_S = 10.0
-#: For requests without anything to check, or checked by their handler.
+#: For requests that need no check, or that their callback checks.
 NO_FIELDS = Fields({})
 
 
@@ -40,7 +39,7 @@ def _check_active(node: Node) -> None:
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
     """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL."""
-    if node.context.ok():  # else the process is ending: what the worker used, and the client, are gone
+    if node.context.ok():  # while the process ends, errors are expected: everything the worker used is gone
         node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
     answer_with(answer, ErrorCode.INTERNAL, f"{type(error).__name__}: {error}")
 
@@ -81,8 +80,8 @@ class WorkerService:
     """A service whose callback runs in a worker thread.
 
     `callback(request, response) -> response` may block. Requests of one service are served one after another, in order;
-    `fields` are checked first. The callback may return a function instead, which waits for the end of what has begun
-    and returns the response. The next request is served meanwhile; if it begins something too, that must end the wait.
+    `fields` are checked first. The callback may instead return a function that waits for the end of the work begun and
+    returns the response. Meanwhile the next request is served; if that begins work too, the wait must end.
     """
 
     def __init__(
@@ -110,7 +109,7 @@ class WorkerService:
 
 
 class WorkerGoal:
-    """A goal as its body sees it: also cancelled by the deactivation of its node, or by a goal that takes over.
+    """A goal for its body: also cancelled by the deactivation of its node, or by a goal that takes over.
 
     Attributes:
         handle: of rclpy.
@@ -151,8 +150,8 @@ class WorkerActionServer(PatientActionServer):
             cancelled; "preempt" asks the running goal to stop and starts the newest one after it.
         fields, admit: checks of the goal's fields, and a function that raises, and logs, the Refusal of a goal.
 
-    Every goal is accepted, and a refused one is then aborted, since only a result has room for the reason. A refused
-    goal does not affect others.
+    Every goal is accepted; a refused one is then aborted, since only a result can carry the reason. A refused goal does
+    not affect others.
     """
 
     def __init__(
@@ -260,7 +259,7 @@ class WorkerActionServer(PatientActionServer):
 
 
 def wait_for_clock(clock: Clock) -> None:
-    """Wait in a worker thread until ROS time runs: simulated time stands at 0 until the first message on /clock.
+    """Wait in a worker thread until ROS time runs: simulated time is 0 until the first message on /clock.
 
     Raises:
         ClockError: no time within CLOCK_S.
@@ -273,10 +272,10 @@ def wait_for_clock(clock: Clock) -> None:
 
 
 def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
-    """Sleep in a worker thread; in ROS time if that is simulated, which may run fast or restart meanwhile.
+    """Sleep in a worker thread; in ROS time if that is simulated: it may then run fast, or restart.
 
-    Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
-    raises ClockError after 10 s plus ten times `seconds` of wall time.
+    Returns True, or False as soon as `cancelled()` is true. Raises ClockError when ROS time stands still (the simulator
+    has ended) for 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
     ticking = clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)  # system time may be set
