@@ -14,20 +14,20 @@ from dm_common import Floats
 
 #: Relative residual at which the iterative solution for the weights stops.
 SOLVED = 1e-5
-#: Name of this tolerance as an argument of `cg`: SciPy 1.11, which Ubuntu 24.04 has, differs from later ones.
+#: Name of this tolerance as an argument of `cg`: SciPy 1.11, in Ubuntu 24.04, differs from later versions.
 _RELATIVE = "rtol" if "rtol" in signature(cg).parameters else "tol"
-#: Candidate standard deviations between actuators, relative to that of the common weights. Likeliest are 0.1 or 0.2 on
-#: mirrors whose densities of relays agree to 15 %, up to 0.8 where each actuator has a density of its own.
+#: Candidates for the standard deviation between actuators, relative to that of the common weights. The likeliest one is
+#: 0.1 or 0.2 for mirrors whose densities of relays agree to 15 %, up to 0.8 if each actuator has a density of its own.
 SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
-#: The value used before the likeliest is known, and where the maps are too few to find it.
+#: The value used before the likeliest is known, and if the maps are too few to find it.
 SPREAD = 0.1
-#: Most actuators, spread over the mirror, that decide between SPREADS; of 37 every second one. The time this takes
-#: grows with the third power of their number.
+#: Largest number of actuators, evenly chosen, that decide between SPREADS (of 37, every second one). The time that this
+#: takes grows with the third power of their number.
 ASKED = 20
 
 
 def alike(actuators: int, spread: float) -> tuple[float, float]:
-    """`between` of :func:`weights_of` for actuators whose weights differ from the common ones by the share `spread`."""
+    """`between` of :func:`weights_of` for a standard deviation `spread` between actuators, see SPREADS."""
     own = spread**-2.0
     return own, own / (actuators + spread**2)
 

@@ -1,9 +1,9 @@
 """One class of hysteresis models fitted to the maps of a calibration run.
 
 ``response = figure(t) + e H`` with the effective signal ``e = sum_f w_f x_f`` of features x (play operators, Duhem
-operator, each with its creep), one set of weights w for all actuators and the gains in H. It is bilinear: H and w are
-found by alternating least squares. The few parameters that enter nonlinearly (slope of the Duhem operator, creep rate)
-are found by Gauss-Newton around that (variable projection [14]).
+operator, each with its creep), one set of weights w for all actuators and the gains in H. This is bilinear, so H and w
+are found by alternating least squares. A Gauss-Newton iteration around that finds the few parameters that enter
+nonlinearly: slope of the Duhem operator, creep rate (variable projection [14]).
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
-#: Ridge on the weights, relative to the mean diagonal of the normal matrix: smooths weights that data do not separate.
+#: Ridge on the weights, relative to the mean diagonal of the normal matrix: smooths weights that maps do not separate.
 RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
-#: The rounds end early once no effective signal changes by more than this: far below what a map can show.
+#: The rounds end early once no effective signal changes by more than this, far below the resolution of a map.
 SETTLED = 1e-6
 #: Ridge on the gains, relative to the trace of their normal matrix: keeps it regular where actuators hardly move.
 SOLVABLE = 1e-13
-#: Guess, bounds and scale of the first coefficient of a slope, of each further one, and of the creep rate.
+#: Guess, bounds and scale: of the first coefficient of a slope, of each further one, and of the creep rate.
 FIRST_SLOPE, FURTHER_SLOPE = (1.5, -30.0, 30.0, 1.0), (0.0, -30.0, 30.0, 1.0)
 CREEP_RATE = (0.01, 0.0, CREEP_RATE_MAX, 0.01)
-#: Most evaluations of the Gauss-Newton iteration: from a guess; from a fit to other rows (its result and one step).
+#: Most evaluations of the Gauss-Newton iteration that starts from a guess, or from a fit to other rows (one step).
 EVALUATIONS, EVALUATIONS_AGAIN = 20, 2
 #: Creep is set to 0 if it lowers the sum of squares, in units of the scatter, by less than CREEP_SHOWN or, without
 #: hysteresis, by less than the share CREEP_SHARE of that sum: slow drift of the figure looks like creep.
@@ -46,7 +46,7 @@ class Candidate:
         powers: highest power of their values.
         slopes: number of coefficients of the Duhem operator's slope; 0 = no such operator.
         own: each actuator has its own weights, drawn towards common ones (:mod:`~dm_calibration.hysteresis.own_laws`);
-            its Duhem operator begins as that of the best common candidate that has one.
+            its Duhem operator starts from that of the best common candidate that has one.
     """
 
     name: str
@@ -186,7 +186,7 @@ def _alternate(features: Floats, measured: Floats, weights: Floats) -> Floats:
     """(F,) weights by least squares, alternating with the gains and starting from `weights`.
 
     Args:
-        features: (M, F, N) without what the figure explains.
+        features: (M, F, N) less the part that the figure explains.
         measured: (M, D) likewise, in units of the scatter.
     """
     rows, count, actuators = features.shape

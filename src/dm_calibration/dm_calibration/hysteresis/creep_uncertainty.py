@@ -1,10 +1,10 @@
 """How well a run determines the creep spectrum.
 
-Creep much younger than a map, or much older than the run, is known from the smoothness of the spectrum alone; creep in
-between is known from the maps. To first order the errors of the weights are those of a Bayesian linear regression on
-the positions and on the states of the creep elements, with figure and gains as fitted. Effects outside the law, such as
-loops that widen with speed, are common to all actuators, so the errors of the responses are not independent: the maps
-count for less, by as much as their residual exceeds independent errors along the features.
+Creep much faster than a map, or much slower than the run, is known from the smoothness of the spectrum alone; creep in
+between, from the maps. To first order the errors of the weights are those of a Bayesian linear regression on positions
+and states of the creep elements, with figure and gains as fitted. Effects outside the law, such as loops that widen
+with speed, are common to all actuators, so the errors of the responses are not independent: the maps count for less, by
+the ratio in which their residual exceeds independent errors along the features.
 """
 
 from dataclasses import replace
@@ -50,9 +50,9 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
     shared = _posterior(evidence / excess, prior)
-    # Evidence of one actuator while all others are free; a dead one has none. Left out are the three patterns that no
-    # response holds, piston and tilt. Each dead actuator is a hidden pattern by itself and replaces one of these three,
-    # which the others cannot form without it. A mirror of three actuators or fewer has no such pattern.
+    # Evidence on one actuator while all others are free; a dead one has none. Left out are the three signal patterns
+    # that make piston and tilt, which no response contains. A dead actuator is such a hidden pattern by itself; without
+    # it the others cannot form one of the three. A mirror of three actuators or fewer has no such patterns.
     moves = np.linalg.norm(gains, axis=1)
     alive = moves > DEAD * moves.max()
     hidden = max(PISTON_TILT if len(gains) > PISTON_TILT else 0, int((~alive).sum()))

@@ -2,14 +2,14 @@
 
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order.
 A map measures the displacements of all N actuators, so one run serves all of them. Once the random shapes show roughly
-where the mirror is flat, every other shape is as in use: of low order, with random signals of each actuator on top,
-about the flat mirror. Actuators that flatten a figure then stay near an end of their range, where random shapes hardly
-come. Creep over minutes shows only if the mean shape over minutes is not flat: the first half of the shapes as in use
-bend the mirror one way, the second half the other way. Random shapes held now and then lie near a bowl in their first
-half, then near its inverse. Maps taken early show creep of the first second. The last fifth are moves as in use alone,
-kept to test the law found from the others. They begin with a degauss, and if they are many another comes halfway. Only
-maps after a degauss show the offset between demagnetised actuators and the mean of their loops; without them the fit
-puts it into the figure, and requests after a degauss are off by a constant.
+where the mirror is flat, every other shape is an *in-use* shape, similar to a request: a low-order shape about the flat
+mirror, with random signals of each actuator on top. Actuators that flatten a figure then stay near an end of their
+range, which random shapes rarely reach. Creep over minutes shows only if the mean shape over minutes is not flat: the
+first half of the in-use shapes bend the mirror one way, the second half the other way. Some random shapes are held; the
+first half of these is close to a bowl, the second half to its inverse. Maps taken early show creep of the first second.
+The last fifth consists of in-use moves only, to test the law found from the others. A degauss precedes them, and a
+second one comes halfway if they are many. Only maps after a degauss show the offset between demagnetised actuators and
+the mean of their loops; without them it is fitted as part of the figure, and requests after a degauss have an offset.
 """
 
 from dataclasses import dataclass
@@ -30,20 +30,20 @@ REPEATS = 8
 MAPS_MIN, MAPS_MAX = 60, 2000
 #: Fewest maps per actuator: each map contributes to the gains and laws of all actuators at once.
 MAPS_PER_ACTUATOR = 2
-#: Swings as shares of the range: with fewer full swings errors in use are larger (studies/comparison/NOTES.md).
+#: Swings as shares of the range: with fewer full swings, requests have larger errors (studies/comparison/NOTES.md).
 SWINGS = (1.0, 1.0, 0.6, 0.3)
-#: From this many maps on, random signals reach the ends of the range, by levels that all actuators share. No map shows
-#: a level, so shorter runs have less of it: after 100 to 200 maps that makes errors up to three times smaller.
+#: From this many maps on, a level common to all actuators takes random signals to the ends of the range. No map shows
+#: a level, so shorter runs use smaller ones: after 100 to 200 maps, errors are then up to three times smaller.
 WIDE_LEVELS_FROM = 250
-#: Share of the shapes that are held, and for how long, s.
+#: Share of the shapes that are held, and range of the times for which they are held, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
-#: Random shapes per actuator after which the flat mirror is known; of the shapes after them one in IN_USE_EVERY is as
-#: in use, with random signals of amplitude SCATTER on top, as a share of half the range.
+#: Random shapes per actuator after which the flat mirror is known; after these, one shape in IN_USE_EVERY is an in-use
+#: shape with random signals of amplitude SCATTER on top, as a share of half the range.
 FLAT_KNOWN, IN_USE_EVERY, SCATTER = 2, 2, 0.3
 #: Amplitude of the random signals on top of the moves that test the law, as a share of half the range.
 CHECK_SCATTER = 0.03
-#: Weight of the bowl in held random shapes; least bending of shapes as in use, as a share of the largest.
+#: Weight of the bowl in held random shapes; smallest curvature of in-use shapes, as a share of the largest.
 BOWL, BENT = 0.7, 0.7
 #: Share of the maps that are taken early, and the share of the settle time after which they are taken.
 EARLY_SHARE, EARLY = 0.3, 0.2
@@ -54,10 +54,10 @@ class Excitation:
     """Commands in order.
 
     Attributes:
-        signals: (M, N) legal shapes, repeats not included; shapes as in use are relative to the flat mirror.
+        signals: (M, N) shapes within the limits, without repeats; in-use shapes are relative to the flat mirror.
         dwell: (M,) s to hold each beyond the settle time before its map.
         settle_share: (M,) share of the settle time to wait.
-        in_use: (M,) which shapes are as in use, including those that test the law.
+        in_use: (M,) which are in-use shapes, including those that test the law.
         check: (M,) which shapes test the law.
     """
 
@@ -104,7 +104,7 @@ def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
 
 
 def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> Excitation:
-    """`maps` commands; shapes as in use begin after the first `random` ones; levels of random shapes may be `wide`."""
+    """`maps` commands; in-use shapes begin after the first `random` ones; levels of random shapes may be `wide`."""
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
     shapes = np.vstack((_random(mirror, maps - checks, wide, rng), _as_in_use(mirror, checks, CHECK_SCATTER, rng)))

@@ -9,22 +9,22 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisS
 #: Weight of one element of an even creep spectrum per unit of creep rate, and of all elements.
 PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
 EVEN = np.full(len(CREEP_TIMES), PER_ELEMENT)
-#: Least creep rate, per decade of time, that a prior assumes.
+#: Least creep rate that a prior assumes, as a share of a step per decade of time.
 RATE_MIN = 1e-3
 
 #: Number of patterns of the prior that are kept.
 PATTERNS = 60
 #: Prior of the weights: overall standard deviation, and the power with which the variance falls with the order.
-#: Held-out errors change by less than a tenth when any of these two and the next two is doubled or halved.
+#: Doubling or halving any of these two and the next two values changes held-out errors by less than a tenth.
 AMPLITUDE, ORDER_POWER = 0.2, 3.0
 #: Correlation length of the weights over the half-width, and decay length of their variance.
 CORRELATION, DECAY = 0.5, 0.35
 #: Variance of the loading curve, relative to that of all play operators together.
 LOADING = 0.3
-#: An actuator's own Duhem operator: fewest coefficients, number of first-order updates of them, and the weight of the
-#: operator below which they are not determined.
+#: An actuator's own Duhem operator: fewest coefficients, number of their first-order updates, and weight of the
+#: operator below which the maps do not determine them.
 DUHEM_ORDERS, DUHEM_ROUNDS, DUHEM_WEIGHT_MIN = 6, 2, 0.01
-#: Step of a coefficient for numerical derivatives, and its largest change in one update.
+#: Step of a coefficient for numerical derivatives, and largest change of a coefficient in one update.
 SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
 #: Number of rows for which creep is computed at a time.
 BLOCK = 32
@@ -42,7 +42,7 @@ def play_values(signals: Floats, radius: Floats, rest: float = 0.0) -> Floats:
 
 
 def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.0) -> Floats:
-    """(M, R D, N) powers 1 .. D of :func:`play_values`, less those at rest; those of one half-width stand together."""
+    """(M, R D, N) powers 1 .. D of :func:`play_values`, less those at rest; all powers of a half-width are adjacent."""
     values = play_values(signals, radius, rest)
     stacked = np.stack([values**power - rest**power for power in range(1, powers + 1)], axis=2)
     return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
@@ -131,10 +131,10 @@ def creep_states(values: Floats, time: Floats, start: float, moved: Floats | Non
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None, weight: Floats = EVEN) -> Floats:
     """Creep of features (M, ...) at each `time` (M,) s; all features were 0 before `start`.
 
-    The state of an element is the feature less its lag, the sum over moves of size times exp(-age / time constant).
+    The state of an element is the feature less its lag: the sum over moves of size times exp(-age / time constant).
 
     Args:
-        moved: (M,) s, when each shape was taken, between the measurements; None = right after the one before.
+        moved: (M,) s, when the mirror took each shape; None = right after the measurement before.
         weight: (J,) of the creep elements, or (J, N) for each actuator, the last axis of the features; by default those
             of an even spectrum, per unit of creep rate.
     """
@@ -160,7 +160,7 @@ def _moved(time: Floats, start: float, moved: Floats | None) -> Floats:
 
 
 def weight_of(rate: float) -> float:
-    """Weight of each creep element that a prior expects of a law with the creep rate `rate`."""
+    """Expected weight of each creep element, in the prior of a law with the creep rate `rate`."""
     return max(rate, RATE_MIN) * PER_ELEMENT
 
 
@@ -191,7 +191,7 @@ def follow(
     """(M, N) effective signals of `signals` (M, N), observed at `time` (M,) s, and the state after the last.
 
     Args:
-        moved: (M,) s, when each was applied, between the observations; None = right after the one before.
+        moved: (M,) s, when each was applied; None = right after the observation before.
 
     Raises:
         ValueError: time stamps that run backwards.

@@ -1,4 +1,4 @@
-"""Identify the law of a mirror from the maps of a run, with the error to be expected of its predictions."""
+"""Identify the law of a mirror from the maps of a run, with the expected error of its predictions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,13 +18,13 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
-#: Most fits, each without the outliers of the one before.
+#: Largest number of fits, each without the outliers of the one before.
 OUTLIER_ROUNDS = 4
-#: Effective signals, which go to about 1, from which on creep from before the run is taken for a drift of the figure.
+#: Creep from before the run above this effective signal (which goes to about 1) is taken for a drift of the figure.
 CREPT_MAX = 1.5
-#: Maps beyond the number of actuators from which on held-out moves show how well laws of each actuator predict requests
-#: (112 maps of 37). With 53 only 40 to 50 % of the requests to three mirrors were inside their bounds, 90 % of them
-#: within 2.1 to 2.9 times the bound: it is counted up with the fourth power.
+#: Number of maps beyond that of the actuators (112 maps for 37) from which on held-out moves show how well laws of each
+#: actuator predict requests. With 53 beyond it, only 40 to 50 % of the requests to three mirrors were inside their
+#: bounds, and 90 % within 2.1 to 2.9 times the bound; so with fewer maps the bound is raised by a fourth power.
 MAPS_BEYOND, FEWER = 75, 4
 #: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
@@ -89,10 +89,10 @@ def fit_hysteresis(
 
 
 def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
-    """Identify the law without outliers; in the run returned only the other maps are usable, all commands stay."""
+    """Identify the law without outliers; in the returned run these maps are not usable, but their commands stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates)
-        # Apart from each other: fits mostly have not seen the test maps, which are then farther from all of them.
+        # Separately: most fits have not seen the test maps, so these have larger residuals than the others.
         usable, good = run.responses.usable, np.zeros_like(test)
         for kind in (usable & ~test, usable & test):
             if kind.any():
@@ -104,7 +104,7 @@ def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) ->
 
 
 def _few_maps(found: Identification, run: Run) -> float:
-    """Factor on the error of held-out moves for the laws of each actuator from few maps, see MAPS_BEYOND."""
+    """Factor on the error of held-out moves if each actuator has its own law and maps are few, see MAPS_BEYOND."""
     beyond = max(int(run.responses.usable.sum()) - run.signals.shape[1], 1)
     own = found.fit.candidate.own and found.fit.candidate.hysteretic
     return max(1.0, (MAPS_BEYOND / beyond) ** FEWER) if own else 1.0
@@ -122,7 +122,7 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
 
 
 def _drifted(law: HysteresisModel) -> tuple[str, ...]:
-    """A sentence where the maps want more creep from before the run than the range of signals can have left."""
+    """A sentence if the maps show more creep from before the run than signals within the range can have left."""
     most = float(np.abs(law.crept).max(initial=0.0))
     if most < CREPT_MAX:
         return ()
@@ -163,15 +163,15 @@ def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, Hys
 
 
 def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
-    """(S, N) effective signals to which the mirror had crept before each degauss, from what fades in the figure.
+    """(S, N) effective signals to which the mirror had crept before each degauss, from the fading part of the figure.
 
-    Without this the fading goes into the figure, which is then valid at the time of the run only. The prior standard
+    Without this the fading part counts as figure, which then holds only at the time of the run. The prior standard
     deviation is 1, the size of all effective signals; that suppresses patterns which the maps hardly show. Maps that
     contradict the effective signals are left out.
 
     Args:
         effective: (M, N).
-        fading: (M, S, N) share of it that is left in each map.
+        fading: (M, S, N) share of that creep that is left in each map.
     """
     good, count, values = responses.usable, responses.coefficients, responses.values
     whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
@@ -203,7 +203,7 @@ def unknown_history_sigma(law: HysteresisModel, low: float, high: float) -> floa
 
 
 def _error_covariance(found: Identification, count: int, maps: MapSet) -> Floats:
-    """(K - 3, K - 3) m^2, error covariance of the `count` coefficients of predicted moves, without noise of maps."""
+    """(K - 3, K - 3) m^2, error covariance of the `count` coefficients of predicted moves, less the noise of maps."""
     rows = found.held_out[:, :count] / TERM_RMS[PISTON_TILT : maps.terms]
     rows = rows[np.isfinite(rows).all(axis=1)]
     size, axes = np.linalg.eigh(rows.T @ rows / len(rows) - np.diag(maps.noise_variance()))

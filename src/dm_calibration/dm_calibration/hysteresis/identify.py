@@ -25,12 +25,12 @@ from dm_common.hysteresis.model import CREEP_RATE_MAX
 SLOPE_MIN = 0.1
 #: A simpler candidate is preferred unless its held-out error is larger by more than this factor.
 PARSIMONY = 1.03
-#: With fewer training maps per actuator than this, or with test maps in the first half of the run (it may end early),
+#: With fewer training maps per actuator than this, or with test maps in the first half of a run (it may end early),
 #: each half of the test maps is predicted by a fit that includes the other half. A fit without any test maps would have
-#: to extrapolate: the median error over mirrors is then 5 to 10 nm after 100 maps; that of the final fit is 3 nm.
+#: to extrapolate: its median error over mirrors is 5 to 10 nm after 100 maps; that of the final fit is 3 nm.
 FEW = 4
-#: Fewest turns and least swing with which an actuator shows its law, and the share of the actuators, at least one, that
-#: may do less: the others determine the common law, which these few then follow.
+#: Fewest turns and least swing (normalised) with which an actuator shows its law. One actuator, or up to QUIET_SHARE of
+#: all, may turn or move less: they then follow the common law of the others.
 TURNS_MIN, SWING_MIN, QUIET_SHARE = 10, 0.3, 0.1
 
 
@@ -44,13 +44,13 @@ class Identification:
 
     Attributes:
         fit: of the chosen candidate, to all maps.
-        held_out: (M, D) residual of maps that had no part in the fit: the test maps, or where there are none, each part
-            of the run in turn; NaN = not predicted.
+        held_out: (M, D) residual of maps that had no part in the fit: the test maps or, without these, each part of the
+            run in turn; NaN = not predicted.
         scores: held-out error of each candidate relative to the best. A richer candidate that hardly fits its own maps
-            better than the best before it has the score of that one.
-        refused: reason for each candidate, and for the final fit, that cannot be inverted or creeps without bound.
-        closest: (M, D) residual of the fit that is closest to most maps, chosen or not: outliers are seen by it, since
-            they can hide behind the larger errors of a law that was chosen because of them.
+            better than the best one before it gets the score of that one.
+        refused: by name, why a candidate, or the final fit, is refused: it cannot be inverted or creeps without bound.
+        closest: (M, D) residual of the fit, chosen or not, that is closest to most maps. It shows outliers, which can
+            hide behind the larger errors of a law that was chosen because of them.
         quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
@@ -96,12 +96,12 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: tried in this order; the first has no hysteresis to invert. An own one is tried if it agrees with
-            the best so far in having hysteresis or not. It begins with the best common law of its kind; if it fades,
-            with another that leaves a much smaller residual; if the result cannot be inverted, with the next.
-        folds: parts of the run that are predicted from the others.
+        candidates: tried in this order; the first must have no hysteresis. One with own laws is tried if the best so
+            far agrees with it in having hysteresis or not. It starts from the best common law of its kind or, with
+            Duhem operators, from one with a much smaller residual; if the result cannot be inverted, from the next.
+        folds: parts of the run, each predicted from the others.
         blocks: contiguous blocks of rows in each part, spread over the run; several avoid extrapolation of slow drift.
-        slope_min: smallest slope allowed of a law over the signals for which it is meant.
+        slope_min: smallest slope that a law may have over the signals for which it is meant.
 
     Raises:
         ExcitationError: the run does not show hysteresis.
@@ -115,7 +115,7 @@ def identify(
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
-    common: list[tuple[float, LawFit]] = []  # also non-invertible ones that fade: own laws may begin with them
+    common: list[tuple[float, LawFit]] = []  # own laws may start from those with Duhem operators, even if refused
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
     residuals: list[Floats] = []
@@ -181,10 +181,10 @@ def identify(
 def _begun(
     run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Bools, slope_min: float
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
-    """Own laws that begin with each of the common laws `starts`, fitted to the rows `keep`, in the order to be tried.
+    """Own laws that start from each of the common laws `starts`, fitted to the rows `keep`, in the order to be tried.
 
-    Duhem operators stay close to where they begin: with a common law without plays that may be far from the truth, with
-    one that cannot be inverted near it. So a start with a much smaller residual than the first precedes it.
+    Duhem operators stay close to their start, which may be far from the truth in a common law without play operators,
+    and near it in one that cannot be inverted. So a start with a much smaller residual than the first one goes first.
     """
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter, slope_min) for fit in starts))
     if candidate.slopes:
@@ -197,7 +197,7 @@ def _begun(
 
 
 def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
-    """Why the law could not be inverted safely; "" = it could."""
+    """Why the law cannot be inverted safely; "" = it can."""
     slope = law_shape.slope_min(fit.law, *run.in_use)
     if slope.min() >= slope_min:
         return ""
@@ -208,7 +208,7 @@ def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
 
 
 def _size(run: Run, residual: Floats) -> float:
-    """Rms of the coefficients in `residual` (M, D); in the other values the noise of maps would hide errors of laws."""
+    """Rms of the coefficients in `residual` (M, D); in its other values, noise of maps would hide errors of laws."""
     return float(np.sqrt(np.mean(np.square(residual[:, : run.responses.coefficients]))))
 
 
@@ -218,10 +218,10 @@ def _contains(richer: Candidate, simpler: Candidate) -> bool:
 
 
 def check_excitation(run: Run) -> tuple[int, ...]:
-    """The few actuators, from 0, that hardly turn or hardly move; runs that cannot show hysteresis are refused.
+    """The few actuators, from 0, that turn or move too little to show their law.
 
     Raises:
-        ExcitationError: fewer maps than unknowns, or many actuators, or all, that hardly turn or hardly move.
+        ExcitationError: the run cannot show hysteresis: too few maps, or too many such actuators.
     """
     usable = int(run.responses.usable.sum())
     actuators = run.signals.shape[1]

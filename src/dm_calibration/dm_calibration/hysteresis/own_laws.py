@@ -1,13 +1,13 @@
-"""Hysteresis and creep laws of each actuator by itself, drawn towards common ones as far as the maps support it.
+"""Hysteresis and creep laws of each actuator, drawn towards common ones where the maps do not determine them.
 
 Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
 any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r. A Gaussian prior
 makes them similar for neighbouring r and small for high orders; only its strongest patterns are kept, so that sixty
 numbers per actuator describe a law. The patterns of all actuators are drawn towards each other: weights that the maps
 hardly determine for one actuator become the mean of the others. Creep is a spectrum over the elements of the model,
-smooth over the logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum
-of their own, since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all
-actuators alike, so what is left out here does not average out in them: it would pass for slow creep.
+smooth over the logarithm of time, also drawn towards a common one. Fast elements may follow loops with a spectrum of
+their own, since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all
+actuators alike, so an effect left out here would not average out in them: it would pass for slow creep.
 
 Responses are linear in the gains of the actuators, in their patterns and in their spectra. Each of the three is solved
 for in turn by regularised least squares, given the other two. The patterns of all actuators are one system, since the
@@ -42,19 +42,19 @@ from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
 from dm_common.hysteresis.law_shape import normalised, slope_min
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
-#: Prior standard deviations: weight of a Duhem operator; that weight times the change of a slope coefficient.
+#: Prior standard deviations: of the weight of a Duhem operator; of that weight times the change of a slope coefficient.
 DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
 #: Linear Duhem operators: rates, per signal travelled; number of powers of the signal that they follow, from 0 on;
 #: prior standard deviation of their weights.
 FADING_RATE, FADING_POWERS, FADING_WEIGHT = np.array([1.0, 3.0, 9.0]), 3, 0.1
-#: Prior of the creep spectrum: standard deviation relative to the common rate; spread of actuators relative to that.
+#: Prior of the creep spectrum: standard deviation relative to the common rate; spread of actuators, relative to that.
 SPECTRUM, SPECTRUM_SPREAD = 0.5, 0.3
 #: Correlation length of that prior, in elements.
 SPECTRUM_CORRELATION = 12.0
 #: Loops may have another spectrum over elements of up to LAG_S (s); LAG: prior standard deviation of the difference.
 LAG_S, LAG = 30.0, 0.02
 LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
-#: Bools of the weights of creep: its elements, and what they add for loops; the last row is the change of creep.
+#: Rows of the weights of creep: its elements, and their additional weights for loops; the last row is the creep slope.
 ELEMENTS, LAGGED = slice(len(CREEP_TIMES)), slice(len(CREEP_TIMES), -1)
 #: Prior standard deviation of the relative change of creep from mid range to the end.
 CREEP_SLOPE = 0.3
@@ -62,16 +62,16 @@ CREEP_SLOPE = 0.3
 #: and held-out errors are up to four times as large; 60 are hardly better. Shorter runs get proportionally more: for
 #: 100 maps errors after 60 rounds are up to a quarter smaller than after 20, on some mirrors a tenth larger.
 ROUNDS, ROUNDS_MAPS = 20, 300
-#: Residual of an outlier during the fit, in medians. A law that follows 16 outliers of 314 maps partly leaves them at 4
-#: to 16 medians: with 8, five are found; with 6, all, one after the other, and they are at 12 to 30 in the end.
+#: Residual from which a map is an outlier during the fit, in medians. A law partly follows 16 outliers among 314 maps,
+#: whose residuals then are 4 to 16 medians: a limit of 8 finds five of them, a limit of 6 finds all, one after the
+#: other, and in the end they have 12 to 30.
 OUTLIER_OF_FIT = 6.0
-#: Fewest maps per actuator to estimate the spread between actuators; the close fit to fewer maps overestimates it.
+#: Fewest maps per actuator from which the spread between actuators is estimated: a close fit to fewer overestimates it.
 ASKED_MAPS = 5
-#: Laws whose slope is too small to be inverted safely lose a share of their hysteresis, in up to SHRINKS steps. A law
-#: with its own Duhem operator that would keep less than SHRUNK of it takes the common operator first. A single law may
-#: be too flat where hardly any map shows it: one that would keep less than LEAST is drawn halfway to the mean of the
-#: others instead, with its Duhem weight halved. If this concerns more than one law and more than the share LOST of
-#: them, they are left unchanged, and the fit will be refused.
+#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in up to SHRINKS steps. If it
+#: has its own Duhem operator and would keep less than SHRUNK, it takes the common operator first. If it would keep less
+#: than LEAST, hardly any map may show where it is too flat: it is drawn halfway to the mean of the others instead, with
+#: half its Duhem weight. If more than one law and more than the share LOST are so flat, all stay: the fit is refused.
 SHRINKS, SHRUNK, LEAST, LOST = 8, 0.9, 0.7, 0.1
 
 
@@ -81,8 +81,8 @@ class OwnFit(LawFit):
 
     Attributes:
         patterns: (F, N) weights of the features of each actuator.
-        creep: (J + L + 1, N) weights of the creep elements, what the first L of them add for loops, and the change of
-            creep per unit of position.
+        creep: (J + L + 1, N) weights of the creep elements, additional weights of the first L of them for loops, and
+            the change of creep per unit of position.
         scatter: (D,) uncertainty of each response, from the residual of these laws.
         changed: (N,) whether a law was changed so that it can be inverted, see SHRUNK.
     """
@@ -98,9 +98,9 @@ class OwnLaws:
 
     Args:
         candidate: play operators and orders of the Legendre series.
-        common: law of all actuators to begin with.
-        scatter: (D,) uncertainty of each response to begin with.
-        slope_min: smallest slope allowed of each law, see SHRUNK.
+        common: law of all actuators from which the fit starts.
+        scatter: (D,) initial uncertainty of each response.
+        slope_min: smallest slope that each law may have, see SHRUNK.
 
     Attributes:
         spread: of the patterns between actuators, estimated in the first fit and reused by later ones to other rows;
@@ -149,7 +149,7 @@ class OwnLaws:
             creep = np.zeros((len(self._creep_root), actuators))
             creep[ELEMENTS] = self._creep if self._creeps else 0.0
             scatter, slope, changed = self._scatter, self._slope, np.zeros(actuators, dtype=bool)
-            if slope.size and actuators > 1:  # a message with one weight holds one slope for both ways
+            if slope.size and actuators > 1:  # in a message, a law with one weight has one slope for both directions
                 slope = padded_slope(slope, actuators)
                 own = self._linear.stop
                 for _ in range(DUHEM_ROUNDS):
@@ -184,7 +184,7 @@ class OwnLaws:
         return OwnFit(self.candidate, law, residual, patterns, creep, scatter, changed)
 
     def _share_kept(self, law: HysteresisModel) -> Floats:
-        """(N,) share of its hysteresis that each law may keep to be inverted safely; 1 or more = all of it."""
+        """(N,) share of its hysteresis that each law can keep and still be inverted safely; 1 or more = all of it."""
         return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.in_use), 0.999)))
 
     def _features(self, slope: Floats) -> Floats:
@@ -194,7 +194,7 @@ class OwnLaws:
         return np.concatenate((self._plain, self.run.fading(FadingHysteresis(slope))), axis=1)
 
     def _changes(self, slope: Floats) -> Floats:
-        """(M, 2 A, N) derivatives of the Duhem operators with `slope` (N, 2, A) by its coefficients."""
+        """(M, 2 A, N) derivatives of the Duhem operators by their coefficients `slope` (N, 2, A)."""
         return self.run.along(lambda signals: fading_changes(signals, slope, self.run.rest))
 
     def _rounds(
@@ -202,7 +202,7 @@ class OwnLaws:
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after all rounds.
 
-        Laws with so many weights follow outliers, so each round leaves out those of the one before: see OUTLIER_OF_FIT.
+        Laws with so many weights follow outliers, so each round leaves out those of the last one: see OUTLIER_OF_FIT.
         """
         sigma = np.full(features.shape[1], DUHEM_CHANGE)
         sigma[: self._linear.stop + 1] = DUHEM_WEIGHT
@@ -266,7 +266,7 @@ class OwnLaws:
         return features * (1.0 + slope[:, None]) + added
 
     def _scatter_of(self, residual: Floats) -> Floats:
-        """(D,) m, robust scatter of the responses, one value for all coefficients; outlying maps hardly affect it."""
+        """(D,) m, robust scatter of the responses, one value for all coefficients; outliers hardly affect it."""
         count = len(residual)
         freedom = max(count - self.run.figure.shape[1] - self._plain.shape[2], 1)
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
@@ -275,7 +275,7 @@ class OwnLaws:
     def _patterns(
         self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, ask: bool
     ) -> Floats:
-        """Weights (F, N): 1 for the signal itself, the others by their prior; `ask`: estimate the spread first."""
+        """Weights (F, N): 1 for the signal itself, the others from maps and prior; `ask`: estimate the spread first."""
         left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
         if ask:
             self.spread = likeliest_spread(features, left, gains, begin[1:])
@@ -285,7 +285,7 @@ class OwnLaws:
     def _spectra(
         self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Bools, free: Floats
     ) -> Floats:
-        """(J + L + 1, N) weights of the creep elements, what they add for loops, and the change of creep."""
+        """(J + L + 1, N) weights of the creep elements, additional ones for loops, and the change of creep."""
         elements = self.run.creep_states(position)
         lags = elements[:, :LAGS] - self._signal_states[:, :LAGS]
         elements = np.concatenate((elements, lags), axis=1)

@@ -1,7 +1,7 @@
 """The law of a mirror from any linear measurement of it: sag, Zernike coefficients, slopes of a wavefront sensor.
 
-Records of other laboratories, of mirrors of any principle, need neither ROS nor map files: commands, measurements and
-times are enough to find which law predicts best, and by how much.
+Records of other laboratories and of other kinds of mirrors need neither ROS nor map files: commands, measurements and
+times suffice to find which law predicts best, and by how much.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from dm_common.hysteresis.model import HysteresisModel
 
 #: Laws that are compared: those of a calibration, and a quadratic one between the linear and the cubic.
 LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
-#: Size to which all measurements are scaled, m: that of a deformation, for which the thresholds of the fit are made.
+#: Size to which all measurements are scaled, m: typical of a deformation, as the thresholds of the fit assume.
 _SIZE = 1e-6
 #: Largest absolute time, s: stamps of maps are int64 numbers of ns.
 TIME_MAX_S = 9e9
-#: s by which `moved` may be beside the times of the maps: what rounding to floats near the present leaves.
+#: Tolerance between `moved` and the times of the maps, s: present Unix times are rounded as floats.
 _ROUNDED_S = 1e-6
 #: Contiguous blocks of rows in each part that is left out.
 _BLOCKS = 5
@@ -32,10 +32,10 @@ _BLOCKS = 5
 
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """What a record shows of its mirror. D is the number of values of one measurement; they keep their own unit.
+    """Result for the mirror of one record. D is the number of values of one measurement, in their own unit.
 
     Attributes:
-        name: class of the law that predicts best; of nearly equal ones the simplest.
+        name: class of the law that predicts best; of nearly equal ones, the simplest.
         law: of the actuators, from the whole record.
         influence: (N, D) change for a unit of each effective signal.
         figure: (D,) measurement at effective signals 0, averaged over the record.
@@ -43,7 +43,7 @@ class ResponseFit:
         held_out: error of each law on parts of the record that it was not fitted to, relative to the signal: rms over
             all numbers, divided by their standard deviation over the record.
         measurements: number of rows used.
-        remark: which actuators moved too little to show a law of their own, as a sentence; "" = none.
+        remark: sentence that names the actuators that moved too little to show their own law; "" = none.
     """
 
     name: str
@@ -84,7 +84,7 @@ def identify_response(
     moved: ArrayLike | None = None,
     candidates: Sequence[Candidate] = LAWS,
 ) -> ResponseFit:
-    """Fit each law to a record and compare what they predict of its parts left out.
+    """Fit each law to parts of a record and compare the predictions for the other parts.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def identify_response(
         there is no hysteresis, from any state.
     measured : array_like (M, D)
         Measurements of equal uncertainty that are linear in the surface: sag or slopes at points, coefficients. First
-        subtract what is not due to the mirror, such as a tilt that changes from map to map. Rows with NaN are ignored.
+        subtract effects other than the mirror's, such as tilt that changes from map to map. Rows with NaN are ignored.
     times : array_like (M,), optional
         Times of the measurements, s; needed for creep and drift. By default one second apart.
     moved : array_like (M,), optional
@@ -106,8 +106,8 @@ def identify_response(
     ExcitationError
         Too few measurements, or more than a tenth of the actuators, and more than one, that hardly move or turn.
     ValueError
-        Arrays that do not belong together, measurements without a whole row or that never change, actuators that always
-        have the same commands, or times that run backwards or are not s.
+        Arrays that do not fit together, measurements that have no complete row or never change, actuators that always
+        have the same commands, or times that run backwards or are not in s.
     """
     signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
     if values.ndim != 2 or len(values) != len(signals):
@@ -179,7 +179,7 @@ def _check_apart(signals: Floats) -> None:
 
 
 def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:
-    """(count,) s from the first measurement on: of the measurements and, where known, of the shapes."""
+    """Times since the first measurement, (count,) s: of the measurements and, if known, of the moves."""
     seconds = np.arange(count, dtype=np.float64) if times is None else seconds_of(times, "times")
     if seconds.shape != (count,):
         raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), s")
@@ -200,10 +200,10 @@ def seconds_of(values: ArrayLike, name: str) -> Floats:
 
 
 def between(moved: Floats, taken: Floats) -> Floats:
-    """`moved` (M,) s, each brought to between the measurement before and its own, which are of `taken` (M,) s.
+    """`moved` (M,) s, each clipped to the interval between the measurements before and after it, `taken` (M,) s.
 
     Raises:
-        ValueError: of another shape, not finite, or beside them by more than rounding.
+        ValueError: another shape, not finite, or outside these intervals by more than rounding.
     """
     if moved.shape != taken.shape:
         raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} numbers of s")

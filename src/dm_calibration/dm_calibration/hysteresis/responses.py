@@ -1,8 +1,8 @@
 """Maps reduced to values of similar uncertainty: Zernike coefficients, and sag beyond them in a few modes.
 
-Coefficients come from all pixels of a map and are good to a fraction of a nanometre; sag at the sampling points is
-coarser, since a point with missing neighbours is the mean of the others. Beyond the coefficients a mirror of N
-actuators shows at most N patterns, so the sag is projected onto those, and each kind is divided by its scatter.
+Coefficients come from all pixels of a map and are accurate to a fraction of a nanometre; sag at the sampling points is
+less accurate, since a point with missing neighbours is the mean of the others. Beyond the coefficients, a mirror of N
+actuators shows at most N patterns, so the sag is projected onto those. Each kind of value is divided by its scatter.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ SCATTER_MIN = 1e-11
 #: Patterns weaker than this share of the strongest are noise.
 WEAKEST_PATTERN = 0.03
 #: Outliers: a map whose residual exceeds OUTLIER medians contradicts the law (the mirror was touched, a door slammed,
-#: or the map is of another). All maps agree if more than the share OUTLIERS_MAX do not.
+#: or the map is of another mirror). If more than the share OUTLIERS_MAX of the maps do, none counts as an outlier.
 OUTLIER, OUTLIERS_MAX = 8.0, 0.1
-#: Least share of points with data for which modes fitted to them fill the gaps; ridge on the amplitudes of these modes,
+#: Least share of points with data from which modes are fitted to fill the gaps; ridge on the amplitudes of these modes,
 #: relative to the information of a map without gaps.
 FILLED_MIN, FILL_RIDGE = 0.9, 1e-3
 
@@ -33,7 +33,7 @@ class Reduction:
     """Converts between K coefficients with sag at P points and R = K - 3 + B values in m rms.
 
     The first K - 3 values are coefficients beyond tilt, each as the rms sag of its term; the others are amplitudes of
-    the B patterns that a mirror's N actuators show beyond the terms, strongest first.
+    the B patterns beyond the terms that the N actuators make, strongest first.
 
     Args:
         influence_sag: (P, N) m per unit signal.
@@ -103,14 +103,14 @@ class Responses:
     usable: Bools
 
     def scatter(self, size: Floats) -> Floats:
-        """(D,) m, uncertainty of each response from residuals of `size` (D,): one value for all coefficients."""
+        """(D,) m, uncertainty of each response from the `size` (D,) of residuals; one value for all coefficients."""
         scatter = np.maximum(size, SCATTER_MIN)
         scatter[: self.coefficients] = np.median(scatter[: self.coefficients])
         return np.asarray(scatter)
 
 
 def responses_of(maps: MapSet) -> Responses:
-    """Reduce `maps`; patterns and missing points come from a linear influence function.
+    """Reduce `maps`, with patterns and missing points from a linear influence function that is fitted to them.
 
     Raises:
         TooFewMapsError: no map can be used.

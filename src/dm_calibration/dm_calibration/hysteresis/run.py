@@ -1,8 +1,8 @@
 """The commands of a calibration run and its maps, in parts that each begin with a degauss.
 
-A part begins where the run began or was resumed. What the actuators did before a part is not known. The degauss erases
-its effect on hysteresis, but not on creep, which fades in an unknown pattern; between two parts the mirror may also
-have drifted. Further degausses within a part erase hysteresis too, but there the creep from before is known.
+A part begins where the run began or was resumed. The history of the actuators before a part is not known. The degauss
+erases its hysteresis but not its creep, which fades in an unknown pattern; between two parts the mirror may also have
+drifted. Further degausses within a part erase hysteresis too, but the earlier creep is then known.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from dm_common import Bools, Floats, Ints
 from dm_common.hysteresis.duhem import FadingHysteresis
 from dm_common.hysteresis.model import HysteresisModel
 
-#: Scale of fading creep of resumed parts: where few maps cannot separate the two, a step of the figure is preferred.
+#: Scale of the fading creep of resumed parts: if few maps cannot tell it from a step of the figure, the step is fitted.
 _FADING_SCALE = 0.1
 
 
@@ -32,10 +32,10 @@ class Run:
         time: (M,) s, of the maps, rising.
         start: s, when the degauss had ended.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
-        segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
-        degaussed: (M,) maps at mid range before which the mirror was degaussed in the course of the run; None = none.
+        segment: (M,) number that changes where the run was resumed with a degauss; None = it was not interrupted.
+        degaussed: (M,) which maps, at mid range, follow a degauss within the run; None = none.
         rest: signal of mid range, where a degauss ends.
-        limits: lowest and highest signal for which a law of the run is meant; None = those of the run.
+        limits: lowest and highest signal for which a law of the run is meant; None = those in the run.
 
     Raises:
         ValueError: time stamps that run backwards.
@@ -90,8 +90,7 @@ class Run:
     def in_use(self) -> tuple[float, float]:
         """Lowest and highest signal at which a law of the run may be inverted: from its reach and the limits.
 
-        With a tight limit between neighbours, short runs stay far from the ends of the range, where polynomials may
-        fall.
+        With a tight limit between neighbours, short runs stay far from the ends, where polynomials may decrease.
         """
         low, high = self.limits or self.reach
         return min(low, self.reach[0]), max(high, self.reach[1])
@@ -125,7 +124,7 @@ class Run:
 
     @cached_property
     def creep(self) -> Floats:
-        """(M, M) creep at each map (row) from the shape of each map (column): even spectrum, per unit of creep rate."""
+        """(M, M) creep at each map (row) by the shape of each map (column); even spectrum, per unit of creep rate."""
         return self.crept(np.eye(len(self.time)))
 
     @cached_property
@@ -156,7 +155,7 @@ class Run:
 
 
 def start_of(moved: Floats | None) -> float:
-    """When the degauss before a run had ended, s since its first map; its first shape may have stood for long."""
+    """When the degauss before a run had ended, s since its first map, whose shape may have been held for long."""
     return -BEFORE_FIRST_MAP_S if moved is None else min(-BEFORE_FIRST_MAP_S, float(moved[0]))
 
 
@@ -173,7 +172,7 @@ def run_of(maps: MapSet) -> Run:
 
 
 def basis_of(columns: Floats) -> Floats:
-    """Orthonormal columns that span `columns`, some of which may be 0 or dependent in the rows at hand."""
+    """Orthonormal columns that span `columns`, of which some may be 0 or linearly dependent in the given rows."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, size > 1e-9 * size[0]])
 

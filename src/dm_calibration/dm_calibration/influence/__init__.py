@@ -1,1 +1,1 @@
-"""The influence function of a deformable mirror: what is commanded, what is measured, and the linear model between."""
+"""The influence function of a deformable mirror: the linear model from commands to measured maps, and its fit."""

@@ -1,4 +1,4 @@
-"""Fit the influence function to the maps of a calibration, and say how good it is.
+"""Fit the influence function to the maps of a calibration, with figures of its quality.
 
 The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 in [1]) and ``z = z0 + H s`` for the sag at the
 sampling points. Both are regressions on the same design: the applied signals and a figure that drifts from reference
@@ -50,7 +50,7 @@ class InfluenceFit:
         in_sample_rms: rms sag over all maps used, m.
         held_out_rms: the same for maps predicted from a fit that has not seen them, m.
         held_out_max_zernike: 95th percentile over held-out maps of the largest coefficient error without piston and
-            tilt, m; plus the joint error of all actuators where the maps show hysteresis that no law describes.
+            tilt, m; plus the joint error of all actuators if the maps show hysteresis that no law describes.
         condition_number: of influence_zernike without piston (and without tilt when the maps do not show it).
         response: (N,) rms sag of a unit signal, m.
         standard_error: (N,) of the response, m.
@@ -99,13 +99,13 @@ def fit_influence(
 
     Args:
         rings: (N,) ring of each actuator, for the grades; None = all are compared with each other.
-        limits: of the signals, if no law describes hysteresis: the error then allows for it; None = it does not.
+        limits: of the signals. If given, the error includes hysteresis that no law describes; None = it does not.
 
     Raises:
         UnknownNameError: an unknown method or label, listing the near ones.
         TooFewMapsError: the good maps do not determine the unknowns.
-        EmptyRegionError: region weights are asked for and some map has no data in a region.
-        ValueError: region weights are asked for and the maps give none.
+        EmptyRegionError: the method needs region weights, and some map has no data in a region.
+        ValueError: the method needs region weights, and the maps determine none.
     """
     options = options or FitOptions()
     if options.method not in METHODS:
@@ -146,7 +146,7 @@ def fit_influence(
 
 
 class _Fitted(NamedTuple):
-    """Which maps (M,) are used, these maps, the design of their regression, its result and its responses."""
+    """Which of M maps are used, those maps, and the design, result and responses of their regression."""
 
     used: Bools
     maps: MapSet
@@ -180,8 +180,8 @@ class _Fitted(NamedTuple):
         outside = scaled > limit
         if not outside.any():
             return None
-        # Its square is what the sum of squares loses without the map. A bad map of high leverage pushes good ones
-        # beyond their (narrower) limits, but its own removal reduces the sum most.
+        # The sum of squares falls by the square of `scaled` when a map is removed. A bad map of high leverage pushes
+        # good ones beyond their (narrower) limits, but its own removal reduces the sum most.
         worst = int(np.argmax(np.where(outside, scaled, 0.0)))
         size, most = 1e9 * scaled[worst], 1e9 * limit[worst]
         return worst, f"outlier: {size:.1f} nm rms from what the maps together say, limit {most:.1f} nm"
@@ -203,7 +203,7 @@ def _judge(
     fitted: _Fitted,
     remarks: list[str],
 ) -> InfluenceFit:
-    """Put the result together with its quality figures."""
+    """Compute the result and its quality figures."""
     used, good, design, regression, responses = fitted
     terms, weight = maps.terms, maps.points.weight
     coefficients = np.zeros((maps.actuators, responses.shape[1]))

@@ -1,4 +1,4 @@
-"""The measured maps of a calibration, one row each: what was commanded and what the interferometer saw."""
+"""The measured maps of a calibration, one row each, with their commands."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
 
-#: Assumed time from the end of a degauss to the first map, s, where it is not known; such young creep is soon gone.
+#: Assumed time from the end of a degauss to the first map, s, if not known; it affects only creep that soon ends.
 BEFORE_FIRST_MAP_S = 1.0
 #: Fewest pairs of maps of the same command from which the noise is estimated.
 PAIRS_MIN = 3
 
 
 class StepKind(StrEnum):
-    """What a step of a calibration does; a step that ends with a map gives the map its kind."""
+    """Kinds of the steps of a calibration, and of the maps with which they end."""
 
     REFERENCE = "reference"
     POKE = "poke"
     SURFACE = "surface"
     EXCITATION = "excitation"
-    #: Also excites hysteresis, with a shape as in use: about the flat mirror.
+    #: Also excites hysteresis, but with an in-use shape, see `dm_calibration.hysteresis.excitation`.
     IN_USE = "in_use"
     CHECK = "check"
-    #: At rest, after a degauss in the course of a run.
+    #: A map at mid range after a degauss within a run.
     DEGAUSSED = "degaussed"
-    #: Without a map.
+    #: The only step without a map.
     DEGAUSS = "degauss"
 
 
@@ -45,7 +45,7 @@ def same_points(a: SamplePoints, b: SamplePoints) -> bool:
 
 @dataclass(frozen=True)
 class MapSet:
-    """M maps column by column; see :class:`~dm_common.measurement.Measurement` for their meaning and unit."""
+    """M maps as columns; see :class:`~dm_common.measurement.Measurement` for their meaning and units."""
 
     points: SamplePoints
     label: tuple[str, ...]
@@ -107,25 +107,25 @@ class MapSet:
 
     @property
     def degaussed(self) -> Bools:
-        """(M,) maps before which the mirror was degaussed in the course of the run."""
+        """(M,) which maps directly follow a degauss within the run."""
         again = np.concatenate(([False], np.diff(self.step) == 0))
         return np.array([kind == StepKind.DEGAUSSED for kind in self.kind], dtype=bool) & ~again
 
     @property
     def rest(self) -> float:
-        """Signal of mid range, where reference frames are taken and a degauss ends, to the step of the electronics.
+        """Signal of mid range, where reference frames are taken and a degauss ends, rounded to four decimals.
 
-        Actuators without a channel stand elsewhere. 0 where there is no reference frame.
+        The median, since actuators without a channel stand elsewhere. 0 if there is no reference frame.
         """
         return round(float(np.median(self.applied[self.reference])), 4) if self.reference.any() else 0.0
 
     def moved_s(self) -> Floats:
-        """(M,) s since the first map: when the mirror took each shape. Where that is not known, and after a degauss
-        (creep follows the middle of its swings): right after the map before, or the degauss before the first map.
+        """(M,) s since the first map: when the mirror took each shape. If that is not known, and after a degauss
+        (creep follows the middle of its swings): right after the map before or, for the first map, after the degauss.
         """
         before = np.concatenate((self.stamp_ns[:1] - round(1e9 * BEFORE_FIRST_MAP_S), self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
-        before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before
+        before = np.where(resumed, self.stamp_ns, before)  # the shapes before are not known
         plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns) & ~self.degaussed
         plausible[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
         return np.asarray(1e-9 * (np.where(plausible, self.moved_ns, before) - self.stamp_ns[0]))

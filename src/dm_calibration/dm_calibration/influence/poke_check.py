@@ -1,4 +1,4 @@
-"""Compare wiring and mounting with the configuration, from how the surface answers to each actuator.
+"""Compare wiring and mounting with the configuration, by the response of the surface to each actuator.
 
 The pose of the whole mirror in the maps is found first (:mod:`~dm_calibration.influence.registration`). Differences
 that remain belong to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
@@ -20,11 +20,11 @@ SHIFT_MAX = 0.1
 SCALE_MAX = 0.03
 #: A displaced actuator must fit its new place better than its own by this much in correlation.
 PLACE_MARGIN = 0.08
-#: Correlation with its own place of an actuator that does not answer: it stays there if no other was found there.
+#: Correlation assumed between a silent actuator and its own place: it stays there if no other was found there.
 OWN_PLACE = 1e-9
-#: A response that correlates less than this with any bump is not that of one actuator.
+#: A response whose correlation with every bump is below this is not that of one actuator.
 LIKENESS_MIN = 0.4
-#: Least median correlation of the responses with the expected bumps; below it the arrangement is another one.
+#: Least median correlation of the responses with the expected bumps; below it the configured arrangement is wrong.
 FIT_MIN = 0.75
 #: Two bumps explain a response if they leave less than this share of the squared residual of one bump, ...
 DOUBLED = 0.5
@@ -32,9 +32,9 @@ DOUBLED = 0.5
 SECOND_MIN = 0.4
 #: An actuator is weak below this share of the median response of its ring, ...
 WEAK_SHARE = 0.4
-#: ... widened by the rings beside it until this many answer: half of a ring may be weak, and the centre is alone.
+#: ... and of neighbouring rings, until this many respond: half of a ring may be weak, and the centre is alone.
 COMPARED_MIN = 11
-#: Fewest actuators that must answer, and the share of them below which the pokes are too small.
+#: Fewest actuators that must respond, and least share of them; with fewer the pokes are too small.
 ANSWERS_MIN = 3
 ANSWERS_SHARE = 0.5
 
@@ -46,7 +46,7 @@ class PokeCheck:
     Attributes:
         registration: pose of the mirror in the maps; None = not known.
         place: (N,) 0-based index of the configured actuator over whose place actuator i raised the surface.
-        turned: whether the mirror is turned, mirrored or shifted by more than what counts as configured.
+        turned: whether the mirror is turned, mirrored or shifted, beyond the tolerances.
         findings: sentences; empty = wiring and orientation are as configured.
     """
 
@@ -91,7 +91,7 @@ def check_pokes(
         x, y: (N,) configured positions, m.
         radius: of the aperture, m.
         silent: (N,) actuators without a response above the noise.
-        unmoved: (N,) actuators that were not driven: left out without a finding.
+        unmoved: (N,) actuators that were not driven, which make no finding.
     """
     count = x.size
     if response.shape != (len(points), count):
@@ -111,7 +111,7 @@ def check_pokes(
         return replace(nothing, findings=(problem, *findings))
     terms = only_terms(unit[active], points)
     single, double = active, {}
-    for _ in range(2):  # again without those that move two places, which would distort it
+    for _ in range(2):  # again without actuators that move two places, which would distort the pose
         stands = register(unit[single], single, points, x, y, radius, terms)
         if stands is None:
             problem = (
@@ -137,7 +137,7 @@ def check_pokes(
         )
         return replace(nothing, findings=(*findings, problem))
     pose, turned = _pose_findings(registration, pitch(x, y))
-    if pose:  # an actuator of the rim may stand beside the aperture as long as that is not on the mirror
+    if pose:  # an actuator at the rim may lie outside an aperture that is not centred on the mirror
         quiet_said = [f"{text} in the maps as they are now: check again once they are corrected" for text in quiet_said]
     findings = quiet_said + pose + _sign_findings(np.sign(found), active) + _place_findings(place)
     for actuator, pair in double.items():
@@ -151,7 +151,7 @@ def check_pokes(
 
 
 def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
-    """Sentences on how `found` differs from the configuration, and whether parameters of the maps correct that."""
+    """Sentences on how `found` differs from the configuration, and whether orientation and aperture correct that."""
     parts = []
     turn, sigma = np.degrees(found.turn), np.degrees(found.turn_sigma)
     if abs(found.turn) > TURN_MAX + 3.0 * found.turn_sigma:
@@ -193,7 +193,7 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
     Args:
         table: (N, N) correlations of each response with the bumps expected at each place.
         overlap: (N, N) of these bumps with each other.
-        height: (N,) their rms for a rise of 1.
+        height: (N,) rms of each bump for a peak of 1.
     """
     found: dict[int, tuple[int, int]] = {}
     apart = ~np.eye(len(overlap), dtype=bool)

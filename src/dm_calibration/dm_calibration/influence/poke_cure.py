@@ -1,4 +1,4 @@
-"""The parameters that correct what a poke check found to differ from the configuration."""
+"""The parameters that correct differences from the configuration, as found by a poke check."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from dm_calibration.optics.orientation import Orientation
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 
-#: Share of its radius by which the aperture may reach beyond the map: few sampling points lie there.
+#: Share of its radius by which the aperture may extend beyond the map: few sampling points lie there.
 OVERHANG = 0.02
 
 #: Parameters by node.
@@ -18,9 +18,9 @@ Changes = Mapping[str, Mapping[str, Any]]
 
 
 def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Sequence[int]) -> tuple[Changes, str]:
-    """What to set so that the poke check passes; it cannot cure dead, weak and doubled actuators, signs and scale.
+    """Parameters with which the poke check passes; they cannot cure dead, weak and doubled actuators, signs and scale.
 
-    The turn and image of the mirror go into the orientation of the maps. A calibration is made in the frame of the
+    Rotation and mirror image are corrected by the orientation of the maps. A calibration is made in the frame of the
     configured positions, so it remains valid when the mirror or the camera is turned.
 
     Args:
@@ -28,7 +28,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         channels: (N,) connector channel of each actuator, as configured; empty = not known.
 
     Returns:
-        The parameters, and a sentence on what they cannot cure; "" = nothing.
+        The parameters, and a sentence on anything that they cannot cure; "" = nothing.
     """
     beyond = ""
     changes: dict[str, dict[str, Any]] = {}
@@ -44,7 +44,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         metres = last.pitch or (mirror.working_radius / last.radius_px if last.radius_px else 0.0)
         middle = 0.5 * (np.array(last.camera) - 1.0)
         follow = any(last.followed)
-        # From the centre of the map, about which the orientation turns, and from the origin of the parameters.
+        # Mirror centre, m: from the map's centre, about which the orientation turns, and from the parameters' origin.
         seen, centre = (
             complex(last.centre[0] - origin[0], origin[1] - last.centre[1]) * metres + complex(*found.shift)
             for origin in (middle, last.followed if follow else middle)
@@ -69,7 +69,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
                 "aperture.centre_x": round(centre.real, 6),
                 "aperture.centre_y": round(centre.imag, 6),
             }
-            if not last.pitch:  # a map without one is refused when the aperture is given in m
+            if not last.pitch:  # with an aperture in m, a map without a pitch would be refused
                 changes["interferometer"]["pitch"] = float(metres)
     own = np.arange(check.place.size)
     if len(channels) == own.size and (check.place != own).any():

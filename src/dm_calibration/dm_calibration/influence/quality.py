@@ -1,4 +1,4 @@
-"""How good an influence function is: held-out error, condition number, a grade per actuator, and its limitations."""
+"""Quality of an influence function: held-out error, condition number, a grade per actuator, and limitations."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +11,24 @@ from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
-#: Variance of a held-out prediction, in variances of one measurement, beyond which it is extrapolation.
+#: Variance of a held-out prediction, relative to that of one measurement, above which it counts as extrapolation.
 EXTRAPOLATION_MAX = 10.0
-#: Share of the median response of all excited actuators up to which one is dead.
+#: An actuator is dead if its response is up to this share of the median response of all excited actuators.
 DEAD_SHARE = 0.02
 
-#: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, as
-#: hysteresis causes in pokes, is no sign of a bad actuator.
+#: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, such as
+#: that of hysteresis in pokes, is no sign of a bad actuator.
 STANDS_OUT = 2.0
 
-#: Maps show hysteresis that no law describes if they miss at least this share of their moves; less may be noise.
+#: Maps show hysteresis that no law describes if their error is at least this share of their moves; less may be noise.
 LOOPS_SHOW = 0.01
 #: Least size of a move as a divisor, m: maps at mid range have no move.
 NO_MOVE = 1e-15
-#: Singular values up to this share of the largest are noise, as of a dead actuator.
+#: Singular values up to this share of the largest count as noise, such as that of a dead actuator.
 LEAST_AUTHORITY = 0.01
-#: Factor from pokes to moves in use: these go up to twice as far, and loops widen with the distance, ...
+#: Factor from pokes to requested moves: these go up to twice as far, and loops widen with the distance, ...
 LOOPS_WIDEN = 2.0
-#: ... but to no more than this many times the allowance of a single actuator: all actuators err alike.
+#: ... but to at most this many times the allowance of a single actuator: all actuators err in the same direction.
 LOOPS_WIDEST = 1.5
 
 # Values of dm_msgs/Calibration.actuator_grade.
@@ -81,9 +81,9 @@ def blur(response: Floats, standard_error: Floats, excited: Bools, weak_sigmas: 
 def folds_of(step: Ints, held: Bools, folds: int) -> Ints:
     """(M,) fold of each map `held` (M,); -1 = it stays in every fit.
 
-    Folds go by commanded states `step` (M,), so that repeated maps of a state stay together, and are dealt out in
-    order: the two directions of a push-pull poke lie in different folds. Reference frames should stay in every fit:
-    without them the figure of the day would be extrapolated, which is not what the influence function is judged by.
+    Commanded states `step` (M,) are dealt out to the folds in order, so that repeated maps of a state stay together and
+    the two directions of a push-pull poke lie in different folds. Reference frames should stay in every fit: otherwise
+    the drifting figure would be extrapolated, by which the influence function is not judged.
     """
     fold = np.full(step.size, -1)
     fold[held] = np.unique(step[held], return_inverse=True)[1] % folds
@@ -99,8 +99,8 @@ def held_out_residual(design: Design, responses: Floats, fold: Ints) -> tuple[Fl
         fold: (M,) as from :func:`folds_of`.
 
     Returns:
-        The residual (M, Q), and which maps (M,) were tested. A map whose prediction is EXTRAPOLATION_MAX times as
-        uncertain as a measurement is not, because the fit without its fold knows too little about what it moves.
+        The residual (M, Q), and which maps (M,) were tested: those whose prediction is not an extrapolation, see
+        EXTRAPOLATION_MAX. Otherwise the fit without their fold knows too little about the actuators that they move.
     """
     residual = np.full(responses.shape, np.nan)
     inflation = np.full(fold.size, np.inf)
@@ -119,14 +119,14 @@ def held_out_residual(design: Design, responses: Floats, fold: Ints) -> tuple[Fl
 def loop_share(left: Floats, moved: Floats, weight: Floats, tested: Bools, allowance: float) -> float:
     """Error by hysteresis that no law describes, as a share of a move over the range.
 
-    A poke shows only the loop of its own actuator, so the residuals of held-out pokes are smaller than what all
-    actuators miss together. Each map counts with its residual along its own move, relative to the largest move so far,
-    which may have left a remanence.
+    A poke shows only the loop of its own actuator, so the residuals of held-out pokes are smaller than the joint error
+    of all actuators. Each map counts with its residual along its own move, relative to the largest move so far, which
+    may have left a remanence.
 
     Args:
         left, moved: (M, P) m, sag of the held-out residuals, and sag by the signals relative to mid range.
         tested: (M,) which maps count.
-        allowance: share of an actuator's move by which it may miss.
+        allowance: error of an actuator as a share of its move.
     """
     size = np.maximum(rms(moved, weight), NO_MOVE)
     tested = tested & (size > DEAD_SHARE * size.max())  # pokes of a dead actuator show noise
@@ -155,9 +155,9 @@ def with_loops(error: float, share: float, influence_zernike: Floats, limits: Li
 
 
 def seen_rms(residual: Floats, sag: Floats, weight: Floats) -> Floats:
-    """(M,) m, rms of the residuals (M, P) over the points at which each map (M, P) has data.
+    """(M,) m, rms of the residuals (M, P) over the points at which each map `sag` (M, P) has data.
 
-    Points that were filled from the fit follow it and show nothing of its error.
+    Points that were filled from the fit show nothing of its error.
     """
     seen = np.isfinite(sag)
     return np.asarray(np.sqrt((np.square(residual) * seen) @ weight / (seen @ weight)))
@@ -166,8 +166,8 @@ def seen_rms(residual: Floats, sag: Floats, weight: Floats) -> Floats:
 def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     """Ratio of the largest to the smallest singular value of G without piston, and without tilt unless it is known.
 
-    In rms-normalised modes, as the tables of mirror makers are: a unit of each mode is then the same rms sag.
-    Only as many modes as there are actuators can be told apart, so of (K, N) with N < K - 1 the N largest count.
+    In rms-normalised modes, as in the tables of mirror makers: a unit of each mode is then the same rms sag. With N
+    actuators only N modes are independent, so if N < K - 1, the N largest singular values count.
     """
     first = 1 if tilt_known else 3
     rms = np.asarray(TERM_RMS)[first : len(influence_zernike), np.newaxis]
@@ -175,7 +175,7 @@ def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
 
 
 def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_known: bool, tested: Bools) -> list[str]:
-    """What a user of an influence function fitted to the maps `good` must know, in sentences.
+    """Limitations of an influence function fitted to the maps `good`, as sentences for its user.
 
     Args:
         grades: (N,) GRADE_*.

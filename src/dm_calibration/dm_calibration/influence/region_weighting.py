@@ -3,11 +3,11 @@
 See :mod:`~dm_calibration.influence.weights` for where weights act; this is its place (a).
 
 Epsilon. In [1] it is a prior parameter. As epsilon goes from 0 to infinity the weights go from w_i ~ 1/r_i (the common
-factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is chosen whose
-influence function best predicts maps it has not seen, by the measure that [1] uses: the rms surface error inside the
-ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is part of the
-prediction. Weights of a fold come from the other folds alone. Where no weights predict better than equal ones, the
-mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
+factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The chosen one is that
+whose influence function best predicts maps it has not seen, by the measure of [1]: the rms surface error inside the ten
+concentric regions, each with the same weight. The figure at rest, which no weights can change, is part of the
+prediction. Weights for a fold come from the other folds alone. If no weights predict better than equal ones, the
+largest epsilon among the best candidates is chosen and the result says so; a prior epsilon can be given instead.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ SURFACES_MIN = 4
 
 @dataclass(frozen=True, eq=False)
 class RegionWeighting:
-    """Weights of the ten regions and where they come from.
+    """Weights of the ten regions and their derivation.
 
     Attributes:
         variance: (R,) r_i, m^2.
@@ -74,7 +74,7 @@ class RegionWeighting:
 
 
 def sample_surfaces(maps: MapSet) -> Bools:
-    """(M,) which maps the region variances are taken over: the surfaces of Table 1, else all but reference frames."""
+    """(M,) maps over which the region variances are taken: the surfaces of Table 1, else all but reference frames."""
     chosen = np.array([kind == StepKind.SURFACE for kind in maps.kind], dtype=bool)
     return chosen if np.unique(maps.step[chosen]).size >= SURFACES_MIN else ~maps.reference
 
@@ -88,7 +88,7 @@ def choose_weighting(
         design: of these maps, (M, p).
         sag: (M, P) m, without gaps, piston and tilt removed.
         folds: at least 2.
-        epsilon: m^2, taken instead of the one cross-validation prefers; the curve is found all the same.
+        epsilon: m^2, used instead of the one that cross-validation prefers; `score` is computed nevertheless.
 
     Raises:
         TooFewMapsError: fewer than four sample surfaces.
@@ -169,7 +169,7 @@ def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
         weights: (R,) of the regions.
     """
     coefficients = sag @ coefficient_operator(maps.points, weights).T
-    # What was removed from the sag is a plane, which is fitted exactly with any weights.
+    # The plane that was removed from the sag is fitted exactly with any weights.
     plane = basis(maps.points.x, maps.points.y)[:, :PISTON_TILT]
     coefficients[:, :PISTON_TILT] += weighted_fit(maps.sag - sag, plane, maps.points.weight)
     return np.asarray(coefficients)

@@ -1,12 +1,12 @@
 """Pose of the mirror in the maps: turn, mirror image, shift, scale and numbering, in one estimate from its pokes.
 
 A poke raises a broad bump over its actuator. Each bump is located by itself. The bumps are assigned one to one to the
-configured places (Hungarian method), alternating with the fit of a similarity (iterative closest point), from starts
-all around; the best similarity is refined on the maps themselves.
+configured places (Hungarian method), alternating with the fit of a similarity (iterative closest point), from start
+angles around the full circle; the best similarity is refined on the maps themselves.
 
-A regular arrangement looks the same after some turns: then a turned mirror cannot be distinguished from one whose
+A regular arrangement looks the same after some turns: a turned mirror then cannot be distinguished from one whose
 numbering begins elsewhere. Of the descriptions that fit equally well, the one is taken that leaves most actuators where
-they are configured, and among several of these the one nearest to the configuration.
+they are configured; among several of these, the one nearest to the configuration.
 """
 
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ Places = NDArray[np.complex128]
 WIDTHS = (0.5, 0.7, 0.9, 1.15, 1.5)
 #: Bumps are looked for up to this distance from the centre of the aperture, in its radii, ...
 REACH = 1.45
-#: ... on a grid of this spacing, in pitches, but no finer than this, in radii: the smallest distance between two
-#: configured places may be a slip, and the grid must not fill the memory for it.
+#: ... on a grid of this spacing, in pitches, but no finer than this, in radii, so that two configured places that are
+#: too close by mistake do not make it fill the memory.
 GRID, FINEST = 0.25, 0.02
 #: Angles around the full circle at which the search starts, for each image and scale.
 STARTS = 36
-#: Places in the middle over which the innermost bump may lie: one and its neighbours.
+#: Number of central places over which the innermost bump may lie: one and its neighbours.
 ANCHORS = 7
 #: Number of best starts that are followed: a hexagonal arrangement looks the same in twelve positions.
 TRIED = 36
@@ -47,7 +47,7 @@ TOGETHER = 0.5
 PLACES_MIN = 3
 #: Descriptions whose mean square distances differ by less than this, in square pitches, fit alike.
 ALIKE = 0.02
-#: Among those, up to this share of the actuators more may be out of place for a smaller turn.
+#: Of those, a smaller turn is preferred even if up to this share of the actuators more is then out of place.
 SHARE = 0.25
 #: Actuators nearer to the centroid than this share of the outermost are used for the refinement: those at the rim
 #: respond differently, since the plate ends there.
@@ -55,10 +55,10 @@ INNER = 0.72
 INNER_MIN = 6
 #: Relative errors of scale and shift due to bumps of another shape than expected.
 SCALE_BIAS = 0.005
-#: The same of scale where only terms are seen, which may have been fitted over a larger aperture.
+#: The same for scale if maps consist of terms only, which may have been fitted over a larger aperture.
 SCALE_BIAS_OF_TERMS = 0.02
 SHIFT_BIAS = 0.02
-#: Rms share of the responses beyond the Zernike terms below which there are only these.
+#: Rms share of the responses beyond the Zernike terms, below which the maps count as consisting of terms only.
 ONLY_TERMS = 1e-6
 
 
@@ -98,8 +98,8 @@ class _Similarity(NamedTuple):
 
 
 class _Match(NamedTuple):
-    """A similarity, the place (A,) of each bump under it, their mean square distance (in square pitches), and which
-    (A,) lie at their places.
+    """A similarity, the place (A,) that it gives each bump, the mean square distance of bumps from their places (in
+    square pitches), and which bumps (A,) lie at their places.
     """
 
     similarity: _Similarity
@@ -116,7 +116,7 @@ def bumps(places: Places, width: float, points: SamplePoints, terms: Floats | No
     """Bumps of unit height at `places` (N,), in radii of the aperture as is `width`: see :func:`unit_responses`.
 
     Args:
-        terms: (P, K) all that the sensor shows of a surface; None = everything.
+        terms: (P, K) the terms to which the sensor reduces a surface; None = it shows everything.
     """
     distance = np.abs(places[:, None] - (points.x + 1j * points.y))
     sag = np.exp(-0.5 * np.square(distance / width))
@@ -130,14 +130,14 @@ def _within(sag: Floats, points: SamplePoints, terms: Floats) -> Floats:
 
 
 def only_terms(unit: Floats, points: SamplePoints) -> Floats | None:
-    """(P, 21) Zernike terms if the responses (A, P) hold nothing else, as those of a sensor do; None = they do."""
+    """(P, 21) Zernike terms if the responses (A, P) contain nothing else, as those of a sensor; None = they do."""
     terms = basis(points.x, points.y)
     left = rms(unit - _within(unit, points, terms), points.weight)
     return terms if np.max(left) < ONLY_TERMS else None
 
 
 def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
-    """`sag` (N, P) without piston and tilt, each of unit rms, and the rms (N,) that each had."""
+    """Rows of `sag` (N, P) without piston and tilt, scaled to unit rms, and the rms (N,) of each before."""
     left = remove_piston_tilt(sag, points)
     size = rms(left, points.weight)
     return np.asarray(left / np.maximum(size, np.finfo(float).tiny)[:, None]), np.asarray(size)
@@ -146,8 +146,8 @@ def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
 def register(
     unit: Floats, active: Ints, points: SamplePoints, x: Floats, y: Floats, radius: float, terms: Floats | None
 ) -> Registration | None:
-    """Find the pose of the mirror in the maps: the best fit, even if the responses are of something else; None where
-    all of them lie over one place or two.
+    """Find the pose of the mirror in the maps: the best fit, however bad it is; None if all responses lie over one or
+    two places.
 
     Args:
         unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
@@ -155,7 +155,7 @@ def register(
         points: the sampling points, of the unit disc.
         x, y: (N,) configured positions, m.
         radius: of the aperture, m.
-        terms: all that is seen of a surface, see :func:`only_terms`.
+        terms: as returned by :func:`only_terms`.
     """
     places: Places = np.asarray((x + 1j * y) / radius, dtype=np.complex128)
     step = pitch(places.real, places.imag)
@@ -201,8 +201,8 @@ def _matched(seen: Places, active: Ints, places: Places, step: float) -> _Match:
 
 
 def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> list[_Similarity]:
-    """The similarities with this `factor` that superpose the centroids, and, where actuators are missing so that the
-    centroids differ, those that put the innermost bump over one of the places in the middle.
+    """The similarities with this `factor` that superpose the centroids, and, if actuators are missing so that the
+    centroids differ, those that put the innermost bump over one of the central places.
     """
     images = _seen(_Similarity(factor, 0j, mirrored), places)
     shifts = [seen.mean() - images.mean()]
@@ -234,7 +234,7 @@ def _closest(seen: Places, places: Places, start: _Similarity, step: float) -> _
 def _refined(
     match: _Match, unit: Floats, points: SamplePoints, places: Places, width: float, radius: float, terms: Floats | None
 ) -> Registration:
-    """Fit similarity and width to the maps of actuators that are well inside both aperture and arrangement."""
+    """Fit similarity and width to the maps of actuators inside the aperture, if possible away from the rim (INNER)."""
     away = np.abs(places - places.mean())[match.place]
     inside = match.placed & (np.abs(_seen(match.similarity, places)[match.place]) < 1.0)
     inner = inside & (away <= INNER * np.abs(places - places.mean()).max())
@@ -275,9 +275,9 @@ def _refined(
 
 
 def _standard_errors(jacobian: Floats, residual: Floats) -> Floats:
-    """(K,) standard errors, from the scatter between actuators A: jacobian (A, P, K), residual (A, P).
+    """(K,) standard errors, from the scatter between the A actuators: jacobian (A, P, K), residual (A, P).
 
-    Neighbouring points of one response err alike, so each actuator counts as one observation.
+    Neighbouring points of a response have similar errors, so each actuator counts as one observation.
     """
     count, _, unknowns = jacobian.shape
     hessian = np.einsum("apk,apl->kl", jacobian, jacobian)

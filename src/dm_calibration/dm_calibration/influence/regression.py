@@ -1,15 +1,14 @@
-"""Eq. (6): the influence function as an ordinary least-squares problem, and the methods.
+"""Eq. (6): the influence function as an ordinary least-squares problem, and the two methods of [1].
 
-Both methods of [1] regress by Eq. (6). AZreg takes the coefficients fitted to every pixel of a map alike; AZWreg
-takes coefficients fitted to the sag with region weights (see :mod:`~dm_calibration.influence.weights` for why the
-weights of Eq. (7) act there and nowhere in the regression).
+Both methods regress by Eq. (6). AZreg takes coefficients fitted to all pixels of a map with equal weight; AZWreg takes
+coefficients fitted to the sag with region weights (:mod:`~dm_calibration.influence.weights` explains why the weights of
+Eq. (7) act there and nowhere in the regression).
 
 The surface at rest drifts during a calibration, so each map is modelled as ``figure(t) + G s``. ``figure(t)`` is a
 straight line between reference frames, and its values at the frames are unknowns of the *same* regression as G.
-Subtracting the interpolated reference frame instead would be the special case in which the frames are taken as free of
-error: the noise of one frame, and the remanence that the hysteresis left in it, would then enter every map of two
-intervals alike. Here all maps of an interval share in fixing its figure, and the frames are as uncertain as any other
-map.
+To subtract the interpolated reference frame instead would assume frames without errors: the noise of one frame, and the
+remanence left in it by hysteresis, would then enter all maps of two intervals. Here all maps of an interval contribute
+to its figure, and the frames are as uncertain as any other map.
 """
 
 from dataclasses import dataclass
@@ -34,9 +33,9 @@ EXCITATION_MIN = 0.0199
 DRIFT_SPARE_MAPS = 5
 #: Smallest singular value of the design, relative to the largest, that still separates the actuators.
 RANK_TOLERANCE = 1e-7
-#: Least share of the information on any combination of unknowns that must remain in the maps which see a point.
+#: Least share of the information on any combination of unknowns that the maps with data at a point must keep.
 SEEN_MIN = 1e-6
-#: Rounds in which sampling points without data are filled from the fit, and the change in m that ends them sooner.
+#: Most rounds in which sampling points without data are filled from the fit, and the change, m, that ends them earlier.
 GAP_ROUNDS = 60
 GAP_TOLERANCE = 1e-11
 
@@ -74,7 +73,7 @@ class Regression:
     Attributes:
         coefficients: (p, Q).
         residual: (M, Q).
-        leverage: (M,) diagonal of the hat matrix; 1 = the map alone fixes something.
+        leverage: (M,) diagonal of the hat matrix; 1 = the map alone determines some unknown.
         covariance: (p, p) of the coefficients for responses of unit variance.
     """
 
@@ -88,8 +87,8 @@ def drift_columns(stamp_ns: Ints, reference: Bools, step: Ints) -> Floats:
     """(M, R) columns of the design: hat functions of time with a knot at the mean time of each reference state.
 
     Repeated maps of a state, which follow each other, share its knot. Before the first and after the last knot the
-    figure is taken as constant. Rows sum to 1. With fewer than two knots there is one column of ones: a constant
-    figure. When the clock was set back during the run, the order of the maps is used as time.
+    figure is constant. Rows sum to 1. With fewer than two knots there is one column of ones: a constant figure. If the
+    clock was set back during the run, the order of the maps serves as time.
 
     Args:
         step: (M,) index of the commanded state.
@@ -134,7 +133,7 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     """Regress `responses` (M, Q) on the design by one QR decomposition.
 
     Raises:
-        TooFewMapsError: some actuators always moved together, naming them.
+        TooFewMapsError: some actuators always moved together; the message names them.
     """
     q, r = np.linalg.qr(design.matrix)
     _, singular, right = np.linalg.svd(r)
@@ -183,8 +182,8 @@ def seen_alike(design: Design, seen: Bools) -> list[SeenAlike]:
 def regress(design: Design, maps: MapSet) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 
-    The fit at a point is that to the maps with data there; rounds are needed because piston and tilt of a map depend on
-    its filled points. Where these maps do not determine the unknowns, filled values take part in the fit, as in the
+    Each point is fitted to the maps with data there; rounds are needed because piston and tilt of a map depend on its
+    filled points. If those maps do not determine the unknowns, filled values take part in the fit, as in the
     expectation-maximisation form of least squares with missing data; they start from the terms of the maps.
 
     Returns:

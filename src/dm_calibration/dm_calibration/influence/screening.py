@@ -1,4 +1,4 @@
-"""Which maps can enter the regression, and why the others cannot; the options of the fit."""
+"""Selection of the maps for the regression, with reasons for the others; options of the fit."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ from dm_common.values import live_parameter, real
 
 #: Median absolute deviation to standard deviation, for normal errors.
 MAD_TO_SIGMA = 1.4826
-#: A map with a leverage above this determines an unknown alone: its residual says nothing about it.
+#: A map with a leverage above this determines an unknown alone, so its residual does not show whether it is good.
 LEVERAGE_MAX = 0.95
 #: Largest share of sampling points without data.
 MISSING_POINTS_MAX = 0.2
-#: Share of the pixels and of the sampling points by which a map may show less than most. Where a part is missing (not
-#: single pixels here and there, which cost no points), what the mirror shows beyond the terms is taken for some of
-#: them: 10 to 20 nm in random shapes, for a gap of a tenth. If more than the share GAPS_MAX of the maps have such gaps,
-#: they are all taken; so are all of a run of pokes, a few of which show all there is of an actuator.
+#: Share of the pixels and of the sampling points that may be missing in a map beyond those missing in most maps. In a
+#: larger gap (unlike scattered pixels, which cost no points) sag beyond the terms distorts the coefficients: by 10 to
+#: 20 nm in random shapes, for a gap of a tenth. If more than the share GAPS_MAX of the maps have such gaps, all are
+#: used; so are all maps of a run of pokes, since only a few of them show an actuator.
 GAP_MAX, GAPS_MAX = 0.03, 0.25
-#: No map with a smaller residual is an outlier, m rms; with a hysteresis law, nor below LAW_ERRORS times the 95 % bound
-#: of the law's error of a coefficient.
+#: No map with a smaller residual, m rms, is an outlier; with a hysteresis law, the limit is at least LAW_ERRORS times
+#: the 95 % bound on the law's error of a coefficient.
 RESIDUAL_FLOOR, LAW_ERRORS = 5e-9, 2.0
 #: Largest share of the maps that may be dropped as outliers.
 DROPPED_MAX = 0.25
@@ -33,7 +33,7 @@ class FitOptions:
     Attributes:
         method: a name of METHODS.
         epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
-        residual_floor: m rms, no map with a smaller residual is an outlier.
+        residual_floor: m rms; no map with a smaller residual is an outlier.
 
     Raises:
         ValueError: fewer than 2 folds, or an epsilon that is not above 0.
@@ -69,7 +69,7 @@ class FitOptions:
 
 
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
-    """Reason for which each map cannot enter a fit; "" = it can."""
+    """For each map, the reason why it cannot enter a fit; "" = it can."""
     reasons = []
     seen, lacking = np.isfinite(maps.coefficients).all(axis=1), np.isnan(maps.sag).mean(axis=1)
     usual, gap = 0.0, np.zeros_like(seen)

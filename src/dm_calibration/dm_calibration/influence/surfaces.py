@@ -1,7 +1,7 @@
 """The 69 sample surfaces of Table 1 in [1], by name.
 
 p01-p54 prescribe signals and are exact. p55-p58 (spheres) and pz01-pz11 (Zernike terms) prescribe a shape; their
-signals come from an influence function by bounded least squares, and the shape aimed at travels with the surface.
+signals come from an influence function by bounded least squares, and the surface contains the shape aimed at.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ ZERNIKE_INDEX = tuple(index for index, term in enumerate(TERMS) if term.n and te
 ZERNIKE_NAMES = tuple(TERMS[index].name.removesuffix(" cos") for index in ZERNIKE_INDEX)
 #: Amplitude of the Zernike surfaces as a share of the largest one the limits allow.
 ZERNIKE_SHARE = 0.5
-#: Damping of the signals towards mid range, relative to the largest singular value of the influence function: keeps
-#: noise from driving actuators that the aperture hardly shows, and costs a shape less than 1 % of its residual.
+#: Damping of the signals towards mid range, relative to the largest singular value of the influence function: so noise
+#: does not drive actuators that the aperture hardly shows; the residual of a shape grows by less than 1 %.
 DAMPING = 1e-2
 
 _LEVELS = {"p01": -1.0, "p02": -0.5, "p03": 0.0, "p04": 0.5, "p05": 1.0}
@@ -45,7 +45,7 @@ TABLE_1 = (*_LEVELS, *_POKES, *_RINGS, *_CENTRE, *MODEL_NAMES)
 
 
 class LinearModel(Protocol):
-    """What a shape is solved from; :class:`~dm_calibration.influence.fit.InfluenceFit` is one."""
+    """A model from which the signals of a shape are solved, such as `dm_calibration.influence.fit.InfluenceFit`."""
 
     @property
     def influence_sag(self) -> Floats: ...
@@ -62,8 +62,8 @@ class Surface:
     Attributes:
         signals: (N,) normalised, inside the mirror's limits.
         nominal: (21,) Zernike coefficients of the shape aimed at, m; None when signals were prescribed.
-        remark: what the mirror's limits changed; "" = nothing.
-        target: the shape aimed at and how far it is out of reach; "" when signals were prescribed.
+        remark: changes due to the mirror's limits; "" = none.
+        target: the shape aimed at, and the residual that the mirror cannot avoid; "" when signals were prescribed.
     """
 
     signals: Floats
@@ -85,7 +85,7 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def missing_on(name: str, mirror: Mirror) -> str:
-    """Why a surface of Table 1 makes no sense on `mirror`; "" = it does."""
+    """Why a surface of Table 1 is not possible on `mirror`; "" = it is."""
     if name in _POKES and _POKES[name] >= mirror.actuators:
         return f"{name} moves actuator {_POKES[name] + 1}; the mirror has {mirror.actuators}"
     if name in _RINGS and not (mirror.rings == _RINGS[name]).any():
@@ -119,7 +119,7 @@ def solve_shape(
     """Signals inside the range for the sag `target` (P,), m, by bounded least squares; piston and tilt are free.
 
     Args:
-        limits: to keep; None = the range alone; the caller then scales the shape to the limit between neighbours.
+        limits: to keep; None = the range alone (the caller then scales the shape to keep the limit between neighbours).
 
     Returns:
         Signals (N,) and the rms sag that is left, m.
@@ -161,11 +161,11 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
         unit[index] = 1.0
         tilt = index < PISTON_TILT
         flat, _ = solve_shape(np.zeros(points.x.size), model, mirror)
-        # Tilt: in proportion to x, since maps do not show it. Others: solved without bounds, scaled to them afterwards.
+        # Tilt: signals in proportion to x, since maps do not show it. Others: solved without limits, then scaled.
         plane = mirror.x / (np.abs(mirror.x).max() or 1.0)
         direction = plane if tilt else _unbounded(basis(points.x, points.y) @ unit, model)
         amplitude = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
-        if tilt:  # a coefficient that is not known in metres counts as 0 after removal of tilt
+        if tilt:  # its coefficient is not known in metres; as tilt is removed from the maps, 0 is nominal
             signals, _ = mirror.limits.scaled(flat + amplitude * direction)
             target = f"{name}: Z_1^1 as a plane of signals of +-{amplitude:.2f}; its size in metres is not measured"
             return Surface(signals, 0.0 * unit, target=target)
@@ -182,7 +182,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
 
 
 def _damped(model: LinearModel) -> tuple[Floats, float]:
-    """(P + N, N) the influence function in sag, weighted by area, above N damping rows; and the damping."""
+    """The area-weighted influence function in sag with N damping rows below, (P + N, N), and the damping."""
     matrix = np.sqrt(model.points.weight)[:, None] * remove_piston_tilt(model.influence_sag.T, model.points).T
     damping = DAMPING * float(np.linalg.norm(matrix, 2))
     return np.vstack((matrix, damping * np.eye(matrix.shape[1]))), damping

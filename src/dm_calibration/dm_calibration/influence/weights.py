@@ -1,4 +1,4 @@
-"""Region weights, Eqs. (7) and (8) in [1]: how they follow from errors, why they cancel, and where they act.
+"""Region weights, Eqs. (7) and (8) in [1]: their derivation from errors, why they cancel, and where they act.
 
 Eq. (8) gives each concentric region a weight from the variance r_i, over the sample surfaces, of the rms surface
 control error inside it. Eq. (7) puts these weights, as a diagonal matrix W, on the rows of dC - G dS. With G free that
@@ -14,10 +14,10 @@ Weights act only where measurements of several regions share unknowns. There are
     min over ds of |W(dC - G dS)| on the vector of sag points (:func:`command_row_weights`). This is what the solver
     "AZWreg" of a controller means.
 
-The ten regions are nested. Two readings of "the points of region i": each point belongs to the smallest disc that holds
-it (the ring between two discs), or a point counts once in every disc that holds it, w_j^2 + ... + w_10^2 in all. The
-first is taken: there w_i acts on region i alone, and equal weights are no weights. In the second even equal weights
-favour the centre ten to one.
+The ten regions are nested, so "the points of region i" has two readings: each point belongs to the smallest disc that
+contains it (the ring between two discs), or it counts once in every disc that contains it, w_j^2 + ... + w_10^2 in all.
+Here the first is used: w_i then acts on region i alone, and equal weights are no weights. In the second reading, even
+equal weights favour the centre ten to one.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def check_epsilon(epsilon: float) -> None:
 def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Floats, points: SamplePoints) -> Floats:
     """Measured sag less its nominal surface, piston and tilt removed: the surface control error of [1], section 2.2.
 
-    The nominal surface is what the 21 terms of G predict for the signals, G s without offset. So the error holds the
+    The nominal surface is G s, the prediction by 21 terms for the signals, without offset. So the error contains the
     initial figure, the print-through beyond 21 terms and the hysteresis.
 
     Args:

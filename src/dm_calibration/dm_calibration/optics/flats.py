@@ -3,7 +3,7 @@
 A map shows the flat in the instrument (as it is seen from behind) plus the part in front of it, which appears mirrored
 in the instrument and may be turned. In Zernike terms, Re(c (x + iy)^m P), a turn by a multiplies the complex
 coefficient c of the part by exp(-ima), and the mirror image is (-1)^m times its conjugate. So for each angular order m
-the maps are one small set of linear equations for the flats. Orders that they leave open are reported and left out.
+the maps give one small set of linear equations for the flats. Undetermined orders are reported and left out.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from dm_common.optics.zernike import MAX_ORDER
 ORDER = 12
 #: Approximate number of pixels to which the terms are fitted.
 FITTED = 20_000
-#: Fewest pixels per term: with fewer, noise and higher orders leak into the terms, and no bound shows it.
+#: Fewest pixels per term: with fewer, noise and higher orders leak into the terms, which the bound does not include.
 PIXELS_A_TERM = 4
-#: Singular values, relative to the largest, below which the maps do not determine a direction: turns almost alike.
+#: Singular values, relative to the largest, below which the maps, turned almost alike, do not determine a direction.
 DETERMINED = 0.1
-#: Bound, in standard deviations, that the largest error of the 18 coefficients of a calibration keeps in 95 % of cases.
+#: 95 % bound, in standard deviations, on the largest error among the 18 coefficients of a calibration.
 LARGEST_SIGMAS = 3.0
 
 
@@ -128,7 +128,7 @@ def _term(place: NDArray[np.complex128], n: int, m: int) -> NDArray[np.complex12
 
 
 def _equations(tests: Sequence[FlatTest], flats: Sequence[str], m: int) -> Floats:
-    """(2 T, 2 F): real and imaginary coefficients of each map from those of each flat as seen in the instrument."""
+    """(2 T, 2 F) matrix from real and imaginary coefficients of flats, seen in the instrument, to those of maps."""
     matrix = np.zeros((2 * len(tests), 2 * len(flats)))
     for number, test in enumerate(tests):
         at, part = slice(2 * number, 2 * number + 2), 2 * flats.index(test.part)

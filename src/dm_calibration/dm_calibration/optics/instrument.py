@@ -22,11 +22,11 @@ RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)
 TILT_MIN = 1e-7
 #: Largest difference of a coefficient between maps of one shape after correction of their retrace error, m.
 LEFT_MAX = 3e-8
-#: Largest share of that difference before correction that may remain; the limit is never below the noise of maps, m.
+#: Largest share of the difference before correction that may remain, but never less than the noise of maps, m.
 LEFT_SHARE, LEFT_NOISE = 0.3, 3e-9
-#: Fewest maps, and fewest points of a grid: enough to leave residuals by which the result can be judged.
+#: Fewest maps, and fewest points of a grid: enough for residuals that show the quality of the result.
 MAPS_MIN, POINTS_MIN = 5, 8
-#: Bounds of scale and distortion from which on a grid says nothing of them: the largest that the node accepts.
+#: A grid is refused if its bound on scale or distortion reaches this value, the largest that the node accepts.
 UNCERTAIN_MAX = 0.1
 
 
@@ -49,7 +49,7 @@ def without_retrace(sag: Floats, retrace: ArrayLike) -> Floats:
     Args:
         retrace: (36,) coefficients of the 18 terms beyond tilt per m of sag at the edge by tilt in x, then in y.
     """
-    if not np.isfinite(sag).any():  # no data, no tilt
+    if not np.isfinite(sag).any():  # without data there is no tilt
         return sag
     x, y, _ = _axes(sag.shape)
     added = np.zeros(len(TERMS))
@@ -97,8 +97,8 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
 
 
 def undistorted(sag: Floats, distortion: float) -> Floats:
-    """(height, width) without radial distortion: at the distance r from the centre (1 at the edge) points were seen
-    further out by the share `distortion` * r**2. Linear between pixels, NaN where any of these is.
+    """(height, width) the map without radial distortion, which shows points at the distance r from the centre (1 at the
+    edge) further out by the share `distortion` * r**2. Linear between pixels, NaN where any of these is.
     """
     from scipy import ndimage  # imported here: most benches need no correction
 
@@ -112,8 +112,8 @@ def undistorted(sag: Floats, distortion: float) -> Floats:
 
 @dataclass(frozen=True)
 class LateralScale:
-    """Result of a grid: m per pixel at the centre of the map, distortion at its edge as a share of the distance, 95 %
-    bounds on the relative error of the pitch and on the error of the distortion, and rms distance left, m.
+    """Result from a grid: m per pixel at the centre of the map, distortion at its edge as a share of the distance, 95 %
+    bounds on the relative error of the pitch and on the error of the distortion, and the rms residual distance, m.
     """
 
     pitch: float
@@ -127,7 +127,7 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     """Lateral scale and distortion from a grid of marks.
 
     Args:
-        marks: (G, 4) column and row at which each is seen, pixels, and its true x and y, m.
+        marks: (G, 4) for each mark, the column and row at which it is seen, pixels, and its true x and y, m.
         shape: (height, width) of the maps.
 
     Raises:
@@ -156,7 +156,7 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
 
 def _similarity(seen: NDArray[np.complex128], place: NDArray[np.complex128]) -> tuple[Floats, Floats, float]:
     """(5,) complex scale, complex shift and distortion that map `seen` (camera coordinates) to `place` (m), their
-    covariance, and the rms distance left, m.
+    covariance, and the rms residual distance, m.
     """
     from scipy.optimize import least_squares
 

@@ -29,7 +29,7 @@ _B = np.array([b for _a, b in _PRODUCTS])
 _SINGULAR = 1e-8
 
 #: Share of the map's energy below which the residual is computed pixel by pixel: as the difference of two large sums it
-#: would have lost its digits.
+#: would lose its digits.
 _CANCELLATION = 1e-8
 
 
@@ -41,7 +41,7 @@ class MapFit:
         coefficients: (21,), Born & Wolf.
         sigma: (21,), one standard deviation each, estimated from the residual as if it were independent from pixel to
             pixel. Print-through and air turbulence are correlated, so the true uncertainty is larger.
-        residual_rms: rms over the valid pixels of what the terms leave.
+        residual_rms: rms, over the valid pixels, of the map less the terms.
         valid_fraction: valid pixels / pixels inside the aperture.
     """
 
@@ -76,7 +76,7 @@ def _zernike_from_products() -> Floats:
 
 @lru_cache(maxsize=4)
 def _disc(aperture: Aperture, shape: tuple[int, int]) -> Bools:
-    """The aperture's pixels, which often stay the same from map to map where the valid ones change."""
+    """Pixels of the aperture, cached: they often stay the same from map to map while the valid pixels change."""
     disc = aperture.disc(shape)
     disc.flags.writeable = False
     return disc

@@ -32,7 +32,7 @@ _PIXELS_PER_RUN = 32
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Rows start to stop; unused are columns before `first` and from `last` on, and the flat indices in `unused`."""
+    """Rows from start to stop. Unused are the columns before `first` and from `last` on, and flat indices `unused`."""
 
     start: int
     stop: int

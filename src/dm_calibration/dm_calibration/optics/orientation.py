@@ -10,7 +10,7 @@ import numpy as np
 from dm_common import Floats
 from dm_common.values import live_parameter, real, switch
 
-#: Deviation from a multiple of 90 degrees that is ignored: it moves no pixel of any camera by a tenth [degrees].
+#: Deviations from multiples of 90 degrees up to this are ignored [degrees]: no pixel of any camera moves by a tenth.
 _EXACT = 1e-3
 
 
