@@ -1,4 +1,4 @@
-"""A calibration: what was measured, the influence function fitted to it, and its provenance."""
+"""A calibration: its maps, the influence function fitted to them, and its provenance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -23,9 +23,9 @@ from dm_common.recipes import NO_RECIPES, RecipeBook
 
 SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
-#: Default of `calibrated_error_max`: a mirror counts as calibrated if its promise is no larger, m; about wavelength/20.
+#: Default of `calibrated_error_max`, m: with a larger promise a mirror counts as approximate; about wavelength/20.
 CALIBRATED_ERROR_MAX = 32e-9
-#: Beginning of limitations that are findings of the poke check.
+#: Prefix of limitations that are findings of the poke check.
 POKE_CHECK = "Poke check: "
 
 _POINTS = ("x", "y", "weight")
@@ -49,16 +49,16 @@ class Calibration:
         aperture_radius: m.
         created_ns: time of writing, ns since the epoch of the node's clock.
         actuator_x, actuator_y: (N,) m, positions as configured at the time of the measurement.
-        dropped: "label: reason" for each state of which no map could be taken.
+        dropped: "label: reason" for each state without a map.
         targets: "label: aim" of each shape solved with an influence function; the coefficients are in maps.nominal.
         limitations: sentences from the fit, the run and the poke check.
         hysteresis: hysteresis and creep model; if given, `fit` acts on effective signals. None = not identified.
         system_error_subtracted: whether the instrument itself subtracted its error: 1 yes, 0 no, -1 not known.
-        reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
-            none.
+        reference_surface: instrument errors subtracted from every map, as text: map with its SHA-256, retrace error,
+            distortion; "" = none.
         instrument_error: 95 % bound on the instrument error remaining in a coefficient, m; 0 = not known.
         scale_error: 95 % bound on the relative error of lengths on the mirror; 0 = not known.
-        region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
+        region_weights: (10,) Eq. (8), for commands weighted by region; empty if no sample surfaces were measured.
     """
 
     id: str
@@ -219,7 +219,7 @@ def _typed(attributes: Mapping[str, Attribute], name: str, kind: type) -> Attrib
 
 
 def _check_result(calibration: Calibration) -> None:
-    """Check shapes and finiteness of everything that a controller will compute with."""
+    """Check shapes and finiteness of all values that a controller uses."""
     fit, maps = calibration.fit, calibration.maps
     n, k, p, m = maps.actuators, maps.terms, maps.points.x.size, len(maps)
     shapes = {

@@ -34,7 +34,7 @@ START_GRACE_S = 5.0
 
 
 class CalibrateAction:
-    """One goal, in a worker thread."""
+    """Carries out one goal, in a worker thread."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class CalibrateAction:
         self._feedback, self._end = Calibrate.Feedback(), 0
 
     def run(self) -> tuple[str, Calibrate.Result]:
-        """Carry out the goal; return how it ended, and the result."""
+        """Carry out the goal; return its outcome (succeed, abort or canceled) and the result."""
         goal, result = self._goal, self._result
         clock = self._node.get_clock()
         started = clock.now()
@@ -82,7 +82,7 @@ class CalibrateAction:
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
 
     def _make_plan(self) -> None:
-        """Make the plan of the goal, and the options that it follows from."""
+        """Make the plan of the goal, and the options that define it."""
         goal = self._goal
         if goal.until and goal.plan != PlanKind.HYSTERESIS:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
@@ -113,7 +113,7 @@ class CalibrateAction:
             result.message = f"{time_text}{expected.accuracy(goal.until, drawn)}; nothing was moved"
 
     def _run_kept(self, runs: UnfinishedRuns) -> None:
-        """Begin or resume a run, keep each map as it arrives, conclude; fills the result, also after a failure."""
+        """Begin or resume a run, store each map at once, and conclude. Fills the result, even after a failure."""
         result, run = self._result, self._opened(runs)
         enough = GoodEnough(
             self._goal.until,
@@ -122,7 +122,7 @@ class CalibrateAction:
         )
         procedure = self._procedure(run, enough)
         try:
-            if run.storing is None:  # else everything is measured, and a calibration that may be stored must not change
+            if run.storing is None:  # else all is measured, and the calibration, which may be stored, must not change
                 procedure.run()
             self._report("fit", "fit", len(self._plan.steps))
             self._conclude(run, runs, enough)
@@ -200,12 +200,12 @@ class CalibrateAction:
 
     def _report_progress(self, now: Progress) -> None:
         self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms
-        # Reference frames, and a degauss in the course of a run, belong to the phase that surrounds them.
+        # Reference frames, and a degauss within a run, belong to the phase around them.
         phase = _PHASES.get(now.kind, self._feedback.phase) if now.done else "degauss"
         self._report(phase, now.label, now.done)
 
     def _report_reached(self, reached: float, maps: int) -> None:
-        """Report the accuracy reached (m) after `maps` maps, and estimate what is left."""
+        """Report the error `reached` (m) after `maps` maps, and estimate the remaining steps."""
         feedback = self._feedback
         feedback.reached_max_zernike = reached
         law = left_of_one_map(self._manager.in_use, self._mirror)
@@ -225,7 +225,7 @@ class CalibrateAction:
                 fit = calibration.fit
             check = check_fit(fit, mirror)
         except ValueError as error:
-            # The same goal would fail in the same way again; the journal is set aside and its maps are kept.
+            # The same goal would fail again in the same way; the journal is set aside, which keeps its maps.
             run.journal.close()
             raise Refusal(
                 error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"

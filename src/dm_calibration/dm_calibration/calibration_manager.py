@@ -33,7 +33,7 @@ class CalibrationManager:
     """Shared by the topics, services and the action of the node; every method is thread-safe.
 
     Attributes:
-        mirror: as the driver describes it; None before it did.
+        mirror: as the driver describes it; None before the driver has done so.
         driver_facts: the driver's wiring and electronics, see :func:`~.calibration_messages.driver_facts`.
         in_use: the calibration in use; None = there is none.
     """
@@ -50,7 +50,7 @@ class CalibrationManager:
 
         Args:
             publish: called with the calibration in use and its file at every change.
-            resting: the reason why no other calibration may be put into use now; "" = it may.
+            resting: returns the reason why no other calibration may be put into use now; "" = one may.
         """
         self.store = store
         self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
@@ -98,10 +98,10 @@ class CalibrationManager:
     def use(self, calibration: Calibration | None) -> str:
         """Use `calibration`, which is in the store, from now on.
 
-        Raises Refusal if the node is inactive by now, or the mirror is another one by now.
+        Raises Refusal if the node is no longer active, or the mirror is another one.
 
-        Returns a warning if it promises clearly less than its predecessor, or if the choice could not be stored for the
-        next start; "" = neither.
+        Returns a warning if the promise is clearly worse than that of its predecessor, or if the choice could not be
+        stored for the next start; "" = neither.
         """
         with self._lock:
             before = self.in_use
@@ -138,7 +138,7 @@ class CalibrationManager:
                 self._put(self.in_use)
 
     def publish_none(self) -> None:
-        """Publish that there is no calibration, unless one is in use by now."""
+        """Publish that there is no calibration, unless one has been put into use meanwhile."""
         with self._lock:
             if self.in_use is None:
                 self._put(None)
@@ -163,8 +163,7 @@ class CalibrationManager:
     def load_last(self) -> tuple[Calibration, str]:
         """Use the calibration that the mirror used last; if that is not known or fails, the newest that fits.
 
-        Returns the calibration, and a sentence: why it is not the one used last, else the warning of `use`; "" = no
-        remark.
+        Returns the calibration, and why it is not the one used last, else the warning of `use`; "" = neither.
 
         Raises:
             Refusal: no mirror, the node is inactive, or no calibration fits.
@@ -220,7 +219,7 @@ class CalibrationManager:
             return after
 
     def keep(self, calibration: Calibration) -> tuple[Path, Calibration]:
-        """Store `calibration`, unless a complete one exists already; returns the file and what is in it.
+        """Store `calibration`, unless that was already done; returns the file, and the calibration read back from it.
 
         Raises:
             StoreError: it cannot be written, or the maps read back differ from those measured.

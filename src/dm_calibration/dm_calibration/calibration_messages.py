@@ -41,7 +41,7 @@ def driver_facts(message: MirrorInfo) -> dict[str, Any]:
 def calibration_message(
     calibration: Calibration | None, file: Path | None, frame_id: str, calibrated_error_max: float
 ) -> CalibrationMsg:
-    """The message on `calibration`; None = no calibration. Its quality is judged by `calibrated_error_max`, m."""
+    """The message for `calibration`; None = no calibration. Its quality depends on `calibrated_error_max`, m."""
     if calibration is None:
         return CalibrationMsg(header=Header(frame_id=frame_id))
     fit, points = calibration.fit, calibration.fit.points
@@ -67,12 +67,12 @@ def calibration_message(
 def put_updates(
     message: CalibrationMsg, kept: InUse, temperature: float, doubts: list[str], mirror_changed: bool
 ) -> None:
-    """Put what later maps have shown into the `message` of the calibration that they update.
+    """Put the updates by later maps into the `message` of their calibration.
 
     Args:
         temperature: degC; NaN = not known.
         doubts: sentences that are added to the known limitations.
-        mirror_changed: the calibration no longer counts as CALIBRATED.
+        mirror_changed: whether maps show a change of the mirror: the calibration then does not count as CALIBRATED.
     """
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:

@@ -70,7 +70,7 @@ class CalibrationNode(ManagedNode):
             self, Calibrate, "calibrate", self._calibrate, exclusive="refuse", fields=requests.CALIBRATE
         )
         self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
-        history = self._listener.history  # of a record that the focus controller writes, and this only reads
+        history = self._listener.history  # begins with the record of the focus controller, which is only read here
         self._recorder = CreepRecorder(self._values["state_folder"], history, self.get_logger().warning)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
@@ -155,9 +155,9 @@ class CalibrationNode(ManagedNode):
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         if before is not None and before.serial != mirror.serial and self._manager.in_use is None:
-            self._start_pending = bool(self._values["load_on_start"])  # another mirror: the one that it used last
+            self._start_pending = bool(self._values["load_on_start"])  # another mirror has a calibration of its own
         if before is not None and before.limits.middle != mirror.limits.middle:
-            self._manager.publish_again()  # a degauss ends at mid range, from where hysteresis is followed
+            self._manager.publish_again()  # hysteresis is followed from mid range, where a degauss ends
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
         self._load_pending()
 

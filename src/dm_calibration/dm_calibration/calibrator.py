@@ -79,12 +79,11 @@ def calibrate(
     commands : array_like (M, N)
         Normalised signals applied to the mirror, one row for each map.
     times : array_like (M,), optional
-        When the maps were taken, s, Unix time or from any start: then the last map counts as taken now. By default as
+        When the maps were taken, s, in Unix time, or from another start (the last map is then dated now). By default as
         given in the files, some of which have whole seconds only. Required for hysteresis.
     moved : array_like (M,), optional
-        When the mirror took each shape, on the clock of ``times``; by default right after the map before. Give it where
-        saving a map or anything else came between: without it creep is found wrong, and held-out errors show little of
-        it.
+        When the mirror took each shape, on the clock of ``times``; by default right after the map before. Give it if
+        time passed in between, e.g. to save a map: otherwise creep is found wrong, which held-out errors hardly show.
     mirror
         Positions of the actuators, working aperture and limits.
     options
@@ -95,7 +94,7 @@ def calibrate(
         Whether to identify hysteresis and creep. The commands must begin after a degauss: some hundred random shapes
         (see :func:`~dm_calibration.hysteresis.excitation.excitation`). The last fifth of the maps tests the model.
     provenance
-        Id, time and note; by default the mirror's names, now, none.
+        Id, time and note; by default an id from the mirror's names and the time, now, and no note.
     run_limitations
         Sentences to add to those of the result.
 
@@ -107,7 +106,7 @@ def calibrate(
     Raises
     ------
     MapFileError, MapRejectedError, InsufficientDataError
-        A file or array is unusable. With ``hysteresis`` a map with too few data is left out, but its command counts.
+        A file or array is unusable. With ``hysteresis``, a map with too few data is left out, but its command counts.
     MeasurementError
         A map cannot be compared with those before it.
     Refusal
@@ -115,9 +114,9 @@ def calibrate(
     TooFewMapsError
         The good maps do not determine the unknowns, or do not show hysteresis.
     ValueError
-        Commands or times that do not match the maps, commands that are not normalised, or, where hysteresis is to be
-        identified, times that are missing, the same for maps of two commands, or run backwards; or shapes taken before
-        the map before or after their own.
+        Commands or times that do not match the maps, or commands that are not normalised; for hysteresis, times that
+        are missing, equal for maps of two commands, or run backwards; or a time in ``moved`` that is not between the
+        map before and its own.
     """
     if isinstance(maps, Outcome):
         outcome = maps
@@ -143,7 +142,7 @@ def calibrate(
     wavelength = outcome.setup.wavelength if outcome.setup else 0.0
     if wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
-    seen = measured.stamp_ns[np.isfinite(measured.coefficients).all(axis=1)]  # times of others may be estimated
+    seen = measured.stamp_ns[np.isfinite(measured.coefficients).all(axis=1)]  # others may have estimated times
     if found and commands is not None and times is None and not (seen % 10**9).any():
         limitations.append("Times of the maps are whole seconds: creep of the first seconds is not well known.")
     if (parts := np.unique(measured.segment).size) > 1:
@@ -191,7 +190,7 @@ def fit_effective(
     """The influence function of `maps`, on effective signals if hysteresis is known; raises as `fit_influence`."""
     if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
-    # Effective signals miss their target by no more than the law errs.
+    # With hysteresis followed, only the error of the law remains, so outliers are judged by that.
     floor = max(options.residual_floor, LAW_ERRORS * hysteresis.held_out_max_zernike)
     followed = replace(options, hysteresis_allowance=0.0, residual_floor=floor)
     fit = fit_influence(effective_maps(maps, hysteresis.law), followed, rings=mirror.rings, exclude=exclude)
@@ -208,7 +207,7 @@ def refit(
     """A new calibration from the raw data of `stored`, without the maps in `exclude`.
 
     Args:
-        mirror: its limits give the error to allow for where hysteresis is not followed; None = no limits known.
+        mirror: its limits give the error to allow for if hysteresis is not followed; None = limits not known.
 
     Raises:
         UnknownNameError: an unknown method or label.

@@ -39,7 +39,7 @@ from dm_common.ros.lifecycle import ERROR, OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService
 from dm_common.values import Fields, from_values, real, text
 
-#: What the fields of its requests may be.
+#: Allowed values of the fields of its requests.
 MEASURE = Fields({"label": text(""), "timeout": real(0.0, 1e-3, 86400.0, "s", zero="as configured")})
 INGEST_FILE = Fields({"path": text("")})
 
@@ -62,7 +62,7 @@ class InterferometerNode(ManagedNode):
         self._last_file = self._last_refusal = ""
         self._last_taken: Measurement | None = None
         self._published: dict[str, str] = {}  # path -> sha256 of maps from the watched folder
-        # Exists in every state: by the lease of this topic others know that the node is alive.
+        # Exists in every lifecycle state: the lease of this topic shows other nodes that this one is alive.
         self._info_publisher = self.create_lifecycle_publisher(
             SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE)
         )
@@ -161,7 +161,7 @@ class InterferometerNode(ManagedNode):
 
     def _take(self, path: Path) -> None:
         surface, measured = self._read(path)
-        # The digest takes longer than the fit: compute it before publishing only if the file may be unchanged.
+        # The digest takes longer than the fit, so it is computed before publishing only if the file may be unchanged.
         before = self._published.pop(str(path), None)
         known = before is not None and before == surface.sha256
         if self.active and not known:
@@ -204,7 +204,7 @@ class InterferometerNode(ManagedNode):
             if not self._map_publishers:
                 return
             surface_map, zernike, samples = self._map_publishers
-            # Most urgent messages first; map and digest take longer than all the others.
+            # The most urgent messages first: map and digest take longer than all others.
             zernike.publish(messages.zernike_message(measured, header))
             samples.publish(messages.samples_message(measured, header))
             self._info_publisher.publish(messages.info_message(surface, measured, header))

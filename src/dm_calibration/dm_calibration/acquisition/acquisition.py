@@ -21,9 +21,9 @@ from dm_common.measurement import Measurement
 from dm_common.values import parameter, real, text, texts
 
 _POLL_OUTPUT_S = 0.01
-#: A watched file's modification time is not believed if further in the past than this: two machines' clocks may differ.
+#: Age of a watched file's modification time, ns, above which it is not believed: clocks of two machines may differ.
 _RECENT_NS = 60 * 10**9
-#: An unreadable folder causes a warning after this time only, s: the program that creates it may still be starting.
+#: Time after which an unreadable folder causes a warning, s: the program that creates it may still be starting.
 FOLDER_PATIENCE_S = 5.0
 
 
@@ -91,7 +91,7 @@ class Acquisition:
             read: reads a map file; raises MapFileError for files that are not (yet) complete.
             now_ns: clock for the times of measurements.
             on_file: called in the watching thread with each new file.
-            on_trouble: called in that thread, once for each trouble: a file refused unread, or an unreadable folder.
+            on_trouble: called in that thread with each new problem: a file refused unread, or an unreadable folder.
         """
         self.settings = settings
         self.source = str(settings.folder or "files named to ingest_file only")
@@ -131,8 +131,8 @@ class Acquisition:
         """Trigger a measurement, or wait for the next new file when there is no trigger command.
 
         Returns:
-            The oriented map and its measurement, stamped with the time of exposure in the run of the trigger command,
-            or with 0 (not known) if the file came without a trigger.
+            The oriented map and its measurement, stamped with the time of exposure during the trigger command, or with
+            0 (not known) if the file came without a trigger.
 
         Raises:
             TriggerError: the trigger command failed.
@@ -183,7 +183,7 @@ class Acquisition:
         return output
 
     def _expected_file(self, path: Path, deadline: float) -> tuple[SurfaceMap, Measurement]:
-        """Read the file that the trigger command was told to write, which may still be growing."""
+        """Read the file that the trigger command had to write, which may still be growing."""
         seen: tuple[int, int] | None = None
         since = time.monotonic()
         trouble: MapFileError | None = None
@@ -211,7 +211,7 @@ class Acquisition:
 
     @contextmanager
     def _arrivals(self, watch: FolderWatch, delay: float) -> Iterator[queue.SimpleQueue[Path]]:
-        """Queue that receives the next file written from now on, but not earlier than `delay` s from now."""
+        """Queue that receives the next file that is written at least `delay` s from now."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
             self._waiting, self._before, self._too_soon = arrivals, set(), 0
@@ -291,7 +291,7 @@ def measured_ns(surface: SurfaceMap, now_ns: int, believe_header: bool) -> int:
     """When the map in a file was measured, ns: as the file says if that is plausible, else `now_ns`.
 
     Args:
-        believe_header: use the time in the file, however old; else the modification time of the file, if recent.
+        believe_header: use the time in the file, however old; otherwise its modification time, if recent.
     """
     if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now_ns:
         return round(surface.time_stamp * 1e9)

@@ -39,7 +39,7 @@ class FileEvent(NamedTuple):
 
 
 class FolderWatch:
-    """Finds new files in a folder (not in subfolders), each state of a file once.
+    """Finds new files in a folder (not in subfolders) and reports each version of a file once.
 
     Files that exist at the first successful listing do not count as new until they are written again.
     """
@@ -56,7 +56,7 @@ class FolderWatch:
         self._stable_time = stable_time
         self._known: dict[str, _Candidate] | None = None
         self._ignored: set[str] = set()
-        # The disk that was listed last, and the known files of the others: one that is mounted later brings old files.
+        # The disk that was listed last, and the known files of other disks: a disk mounted later brings old files.
         self._disk = 0
         self._known_on: dict[int, dict[str, _Candidate]] = {}
 
@@ -96,7 +96,7 @@ class FolderWatch:
         return [event for _time, event in sorted(ready)]
 
     def _seen_elsewhere(self, listed: Mapping[str, Signature]) -> dict[str, _Candidate] | None:
-        """The known files of a disk that has come back as another device, by one that is `listed`; None = none has."""
+        """Known files of a disk that has come back as another device, known by a `listed` file; None = none has."""
         for device, known in self._known_on.items():
             if any(listed.get(name) == candidate.signature for name, candidate in known.items()):
                 return self._known_on.pop(device)

@@ -1,4 +1,4 @@
-"""From a map file to oriented map, aperture, Zernike fit and samples. Independent of ROS."""
+"""Reading of a map file: oriented map, aperture, Zernike fit and samples. Independent of ROS."""
 
 import threading
 from dataclasses import astuple, dataclass, field, replace
@@ -71,7 +71,7 @@ class IngestSettings:
         "Lateral resolution per pixel, as found by `./dm measure --reference-sphere METRES`; files that state a value "
         "more than 5 % off are refused. 0 = as stated in the file.",
     )
-    # Retrace error and distortion are subtracted then; see `dm_calibration.optics.instrument`.
+    # Corrected in every map after `reference` is subtracted; see `dm_calibration.optics.instrument`.
     retrace: tuple[float, ...] = parameter(
         reals([], -1.0, 1.0),
         "Retrace error, proportional to tilt: 36 numbers from `./dm instrument retrace FILES`; empty = none.",
@@ -100,7 +100,7 @@ class IngestSettings:
 
     @property
     def corrections(self) -> str:
-        """Text on the instrument errors that were subtracted from the maps, stored with them; "" = none were."""
+        """The instrument errors that are subtracted, as text to store with the maps; "" = none."""
         parts = []
         if self.reference is not None:
             parts.append(f"{Path(self.reference.file).name}, SHA-256 {self.reference.sha256}")
@@ -119,7 +119,7 @@ def too_large(radius: float, mirror_radius: float) -> str:
 
 
 class Ingest:
-    """Reads and fits map files, one at a time however many threads ask, so that memory use stays constant."""
+    """Reads and fits map files, one at a time even for several threads, so that memory use stays constant."""
 
     def __init__(self, sample_count: int = 500) -> None:
         self.points = edge_clustered_points(sample_count)
@@ -130,8 +130,8 @@ class Ingest:
     def read(self, path: Path, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         """Read, orient and fit one file: returns the oriented map and its measurement.
 
-        Coefficients and samples include piston and tilt. The digest of the file is left to :attr:`SurfaceMap.sha256`,
-        the time stamp to the caller.
+        Coefficients and samples include piston and tilt. The measurement lacks the digest of the file, which is
+        :attr:`SurfaceMap.sha256`, and its time stamp.
 
         Raises:
             MapFileError: the file is not a whole, readable map.

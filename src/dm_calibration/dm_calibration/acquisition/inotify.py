@@ -1,4 +1,4 @@
-"""Notification by the kernel of files that were written: at once, where polling must wait until they are stable.
+"""Immediate notification by the kernel of written files; polling would have to wait until they are stable.
 
 Linux reports only writers on this machine (inotify(7)); files that another machine writes are found by polling.
 """

@@ -1,4 +1,4 @@
-"""Maps not measured by a run of this suite: files, arrays or measurements, with their commands."""
+"""Maps from elsewhere than a run of this suite: files, arrays or measurements, with their commands."""
 
 import re
 import time
@@ -23,13 +23,13 @@ from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.values import check_parameters
 
-#: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
+#: Sources of a calibration: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
-#: Unix times before this one, s, in 1973, count from any start.
+#: Times below this, s (in Unix time, 1973), count from an arbitrary start.
 UNIX_MIN_S = 1e8
 
-#: Times further ahead than this are no Unix times, s (LabVIEW counts from 1904): clocks may differ by less.
+#: Times further in the future than this, s, are no Unix times (LabVIEW counts from 1904); clocks differ by less.
 AHEAD_MAX_S = 86400.0
 
 #: Largest peak-to-valley sag of an array, m: a larger one indicates another unit.
@@ -52,7 +52,7 @@ def outcome_of(
     whole numbers.
 
     Args and errors as for :func:`~dm_calibration.calibrator.calibrate`, but `times` are Unix times. If neither `times`
-    nor the files give the times of all maps, they are set one second apart, the last one to the present.
+    nor the files give the times of all maps, the maps are dated one second apart, the last one now.
     """
     settings = settings or IngestSettings(aperture_radius=mirror.working_radius)
     check_parameters(settings)
@@ -89,7 +89,7 @@ def outcome_of(
     if hysteresis:
         _check_times(measured, signals)
     outcome = Outcome()
-    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # one that never moves rests where it is
+    rest = np.where(np.ptp(signals, axis=0) > 0.0, mirror.rest, signals[0])  # actuators that never move rest there
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
     kinds = _kinds(np.abs(signals - rest) > 1e-9, hysteresis)
     for number, (one, row, kind) in enumerate(zip(measured, signals, kinds, strict=True)):
@@ -104,7 +104,7 @@ def outcome_of(
         if outcome.setup is None:
             outcome.take(Setup.of(one))
             if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
-                # No map shows the end of the degauss, which on a mirror driven in one direction is not at 0.
+                # No map shows the mirror after the degauss, at mid range: not 0 on a mirror driven in one direction.
                 begin = {"kind": StepKind.REFERENCE, "step": -1, "signals": rest, "applied": rest}
                 outcome.take(
                     without_map(one, label="degauss", stamp_ns=(one.moved_ns or one.stamp_ns) - 10**9, **begin)
@@ -115,7 +115,7 @@ def outcome_of(
 
 
 def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Floats | None]:
-    """`times` (M,) and `moved` (M,), s, as Unix times: if they count from any start, the last map is of the present."""
+    """`times` (M,) and `moved` (M,), s, as Unix times; if they count from another start, the last map is dated now."""
     taken, shapes = seconds_of(times, "times"), None if moved is None else seconds_of(moved, "moved")
     last = taken.max(initial=-np.inf)
     if time.time() + AHEAD_MAX_S < last < TIME_MAX_S:  # beyond that it is no number of s
@@ -133,7 +133,7 @@ def _moved(measured: Sequence[Measurement], moved: Floats) -> list[Measurement]:
 
 
 def _check_times(measured: Sequence[Measurement], signals: Floats) -> None:
-    """Raise ValueError where times of maps do not tell hysteresis and creep apart."""
+    """Raise ValueError if the times of maps do not separate hysteresis from creep."""
     stamps = np.array([one.stamp_ns for one in measured])
     if not np.ptp(stamps) and len(stamps) > 1:
         raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
@@ -153,13 +153,13 @@ def _by_number(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Measurement], dict[int, str]]:
-    """One measurement per map; those from files with time and digest.
+    """One measurement per map; from files, with time and digest.
 
     Args:
-        gaps: whether a map with too few data is replaced by a gap, so that its command stays in the actuators' history.
+        gaps: whether a map with too few data becomes a gap, which keeps its command in the actuators' history.
 
     Returns:
-        The measurements, and by index the reason for each gap.
+        The measurements, and the reason for each gap by its index.
     """
     if isinstance(maps, str | Path):
         folder = Path(maps)
@@ -179,7 +179,7 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     if last is None:
         raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
     told = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns} or {0: 0}
-    # Files without data tell no time: it lies between those of the maps around it; 0 = there are none on either side.
+    # The time of a file without data is interpolated between the maps around it; 0 = no map on one side.
     between_told = np.interp(range(len(found)), [*told], [*told.values()], left=0, right=0)
     measured = []
     for one, at in zip(found, between_told, strict=True):
@@ -193,7 +193,7 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
     if isinstance(one, str | Path):
         surface, measured = ingest.read(Path(one), settings)
         # Not the modification time: for copies that is the time of copying.
-        told = surface.time_stamp or 0.0  # NaN, or no time at all, in a damaged file: then none is known
+        told = surface.time_stamp or 0.0  # in a damaged file NaN or absurd, and then not known
         known = 0.0 < told <= time.time() + AHEAD_MAX_S
         return replace(measured, stamp_ns=round(1e9 * told) if known else 0, sha256=surface.sha256)
     sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data

@@ -18,7 +18,7 @@ from dm_common.optics.zernike import basis
 
 #: Width and height, in pixels, of the map that is drawn from coefficients.
 PIXELS = 256
-#: Relative difference of radii that is rounding.
+#: Relative difference between radii that counts as rounding.
 SAME_RADIUS = 1e-6
 
 #: A surface, and the residual that the sensor reports, m rms.
@@ -34,7 +34,7 @@ def disc_terms() -> Floats:
 
 
 def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-    """Map and measurement from what a sensor saw: over the configured aperture, else over that of the sensor.
+    """Map and measurement from the surface `seen` by a sensor, over the configured aperture, else over the sensor's.
 
     Raises:
         MapRejectedError, InsufficientDataError: see :class:`Ingest`; also if the aperture is larger than the sensor's.
@@ -56,7 +56,7 @@ class SensorAcquisition:
     """Takes the first measurement begun after a request; measurements between requests are ignored.
 
     Args:
-        read: makes the map and the measurement from what the sensor saw.
+        read: makes the map and the measurement from the surface that the sensor saw.
     """
 
     #: Always "": a sensor uses no folder.
@@ -82,7 +82,7 @@ class SensorAcquisition:
             self._changed.notify_all()
 
     def offer(self, seen: Callable[[], Seen], stamp_ns: int) -> None:
-        """Offer what the sensor saw at `stamp_ns`; `seen` is evaluated only if a request waits for it."""
+        """Offer the surface `seen` by the sensor at `stamp_ns`; it is evaluated only if a request waits for it."""
         with self._changed:
             if 0 <= self._since <= stamp_ns and self._seen is None:
                 self._seen = seen, stamp_ns

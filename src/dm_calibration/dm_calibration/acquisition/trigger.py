@@ -13,7 +13,7 @@ from typing import IO
 
 from dm_common.errors import CodedError, ErrorCode
 
-#: In an argument of the command, stands for the file that the instrument is expected to write.
+#: Stands, in an argument of the command, for the file that the instrument is to write.
 PLACEHOLDER = "{path}"
 
 _OUTPUT_SHOWN = 500  # characters of the command's output in an error message

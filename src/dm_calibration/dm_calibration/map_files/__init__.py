@@ -26,8 +26,8 @@ _START_BYTES = 4096
 def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> SurfaceMap:
     """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file, a FITS file, or one of 4Sight.
 
-    The format is recognised by the content; the suffix matters only between the two text formats, whose titles are
-    sometimes mixed up.
+    The format is recognised by the content; the suffix matters only for the two text formats, whose titles are
+    sometimes exchanged.
 
     Args:
         xyz_unit: unit of the values of an `.xyz` file, one of XYZ_UNITS, and of a FITS file without BUNIT; other

@@ -1,4 +1,4 @@
-"""The structure of an HDF5 map, checked before the memory that it claims is allocated, and reading of its values."""
+"""Check of the structure of an HDF5 map before memory of the size it states is allocated, and reading of its values."""
 
 import math
 import struct
@@ -24,7 +24,7 @@ _HEIGHT_TYPES = ("<f8", "<f4", "<i4", "<i2", "<u4", "<u2", "<i8", "<u8")
 #: Largest compression ratio of Deflate, the densest filter that Mx uses [bytes per byte].
 _DENSEST = 1032
 
-#: Smallest heights in any unit, by bytes per value, that are accepted: the shortest length in use, 1 pm, is 1e-12 m.
+#: Smallest accepted heights in any unit, by bytes per value; 1 pm, the shortest length in use, is 1e-12 m.
 _LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
 
 _FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
@@ -69,10 +69,10 @@ def read_heights(surface: Any, content: bytes, no_data: float) -> Floats:
     """(height, width) values of a map, NaN = no data, after its storage was checked against the whole file.
 
     Args:
-        no_data: values from this one upwards mean no data; NaN = only those that are not finite do.
+        no_data: values from this one upwards mean no data; NaN = only values that are not finite do.
 
     Raises:
-        MapFileError: not a table of numbers, one whose storage is not as declared, or a filter is not available.
+        MapFileError: not a table of numbers, storage that is not as declared, or a filter that is not available.
     """
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
         raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
@@ -114,9 +114,10 @@ def _check_storage(surface: h5py.Dataset, length: int) -> None:
 
 
 def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
-    """Check the address of the values, which the file states only once; a damaged one is too low or too high.
+    """Check the address of the values, which the file states only once.
 
-    If the map has corners without data, runs of "No Data" are then found within a row before the range, or behind it.
+    If a damaged address is too low or too high, and the map has corners without data, runs of "No Data" values are
+    found within one row before or after the range that it gives.
     """
     start = surface.id.get_offset()
     if start is None or surface.dtype.kind != "f":  # stored in chunks, or integers, which have no such value
@@ -124,7 +125,7 @@ def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
     end, row = start + surface.id.get_storage_size(), surface.shape[1] * surface.dtype.itemsize
     one = np.asarray(no_data, surface.dtype).tobytes()
     for first, last in ((max(0, start - row), start), (end, end + row)):
-        # A single one may be the value of an attribute, except directly behind the range, where no attribute begins.
+        # A single such value may be that of an attribute, except directly after the range, where no attribute begins.
         outside = 2 * one in content[first:last] or (first == end and content[first:last].startswith(one))
         if outside and not _other_values(surface, first, last):
             raise MapFileError(
@@ -164,8 +165,8 @@ def _read_values(surface: h5py.Dataset) -> Floats:
 def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
     """Refuse heights that are the file's own metadata: the address of the data is stored only once.
 
-    A damaged address moves the start of the data a little, into counts and addresses of the file structure. Read as
-    floating-point numbers these are smaller than any height could be.
+    A damaged address shifts the start of the data into counts and addresses of the file structure. Read as
+    floating-point numbers, these are smaller than any height.
     """
     if stored.dtype.kind != "f":
         return

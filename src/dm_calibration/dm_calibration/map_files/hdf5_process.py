@@ -17,7 +17,7 @@ from dm_calibration.map_files.surface_map import MAX_PIXELS, MapFileError
 from dm_calibration.store.hdf5_image import ImageError, parse_image
 from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, receive, send
 
-#: Address space on top of that at the start and that of the file, bytes: the largest map, and a working copy.
+#: Address space allowed beyond that at the start and that for the file, bytes: for the largest map, and a working copy.
 MEMORY = 3 * 8 * MAX_PIXELS
 
 Found = tuple[dict[str, Any], dict[str, np.ndarray]]

@@ -27,7 +27,7 @@ MAX_PIXELS = 2**25
 #: Units of length used in files, as m.
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 
-#: Largest height of a map, or coefficient of a sensor, m: beyond the range of any instrument, so of another unit.
+#: Largest height of a map, or coefficient of a sensor, m: no instrument measures more, so it would be another unit.
 HEIGHT_MAX = 1e-3
 
 #: Largest relative difference between the pitches along x and y for which pixels count as square.
@@ -92,7 +92,7 @@ class SurfaceMap:
     def sha256(self) -> str:
         """SHA-256 of the file's bytes, hexadecimal; "" without a file. Computed on first use.
 
-        It takes as long as reading the file, and only the record of where a calibration comes from needs it.
+        It takes as long as reading the file, and only the provenance of a calibration needs it.
         """
         return hashlib.sha256(self.content).hexdigest() if self.content else ""
 

@@ -10,7 +10,7 @@ from dm_common.errors import CodedError, ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import HysteresisObserver, Observed
 
-#: Signals, or effective signals, whose normalised difference is smaller count as the same shape: below 1 nm.
+#: Signals, or effective signals, that differ by up to this (normalised) count as the same shape: below 1 nm of sag.
 SMALL_MOVE = 2e-4
 
 
@@ -34,7 +34,7 @@ class SettledState:
 
 
 class AppliedHistory(HysteresisObserver):
-    """Recent states of the mirror under one hysteresis model; thread-safe, but for `follow`."""
+    """Recent states of the mirror under one hysteresis model; thread-safe, except for `follow`."""
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
         """Follow `law` from now on, and apply it to earlier reports as well; None = no hysteresis."""
@@ -46,7 +46,7 @@ class AppliedHistory(HysteresisObserver):
             return self.latest is not None and self.latest.heard >= time
 
     def still_for(self, time: float) -> float:
-        """How long the mirror had kept its present shape at `time`, s; 0 = it moves, infinite = no report yet."""
+        """How long the mirror has kept its present shape until `time`, s; 0 = it moves, infinite = no report yet."""
         observed = self.recent()
         if not observed:
             return float("inf")
@@ -57,8 +57,8 @@ class AppliedHistory(HysteresisObserver):
     def settled(self, time: float, still: float) -> SettledState:
         """The state at `time` (s), if the mirror kept its shape from `still` (s) before to `still` after.
 
-        Corrections that hold a shape against creep do not count as a move: their effect follows from the hysteresis
-        model, and the signals at `time` are known.
+        Corrections that hold a shape against creep do not count as moves: the signals at `time` are known, and the
+        hysteresis model gives their effect.
 
         Raises:
             MapNotUsableError: the mirror moved, or this or the hysteresis of the actuators is not known.
@@ -99,7 +99,7 @@ class AppliedHistory(HysteresisObserver):
         return first
 
     def _keeps(self, shape: Observed, seen: Observed) -> bool:
-        """Whether the mirror had the shape of report `shape` at report `seen`: same signals, or same surface."""
+        """Whether the mirror had the shape of report `shape` at report `seen`: same signals or effective signals."""
         law, state, report = self.law, seen.estimate.state, seen.report
         ends = [report.signals]
         if report.moving:

@@ -1,7 +1,7 @@
-"""Detection, from its reference frames, of a mirror that was bumped in the middle of a run.
+"""Detection, by reference frames, of a mirror that was bumped in the middle of a run.
 
-All reference frames show the same command. Between two of them the map may change by the hysteresis left behind and by
-a little drift; a larger change of tilt, position on the camera or figure means that the mirror was bumped.
+All reference frames show the same command. Between two of them the map may change by remaining hysteresis and by a
+little drift; a larger change of tilt, position on the camera or figure means that the mirror was bumped.
 """
 
 import math
@@ -16,10 +16,10 @@ from dm_common.mirror import Mirror
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_common.values import live_parameter, real
 
-#: Uncertainty of the place of an aperture that is found on a map, pixels.
+#: Uncertainty of the position of an aperture found on a map, pixels.
 _WANDER_PX = 1.5
-#: Factor on the allowance: errors of actuators that moved together exceed the rms sum of independent ones. A run whose
-#: held shapes alone lean to a bowl in one half and to its inverse in the other left 1.3 to 1.6 times as much.
+#: Factor on the allowance: errors of actuators that moved together exceed the rms sum of independent ones, 1.3 to 1.6
+#: times in a run in which only the held shapes are close to a bowl in one half, and to its inverse in the other.
 _TOGETHER = 2.0
 
 
@@ -46,7 +46,7 @@ class BumpCheck:
     """Compares each reference frame with the one before it."""
 
     def __init__(self, options: BumpOptions, mirror: Mirror, allowance: float) -> None:
-        """`allowance`: error of actuators as a share of their moves."""
+        """`allowance`: error of an actuator by hysteresis, as a share of its move."""
         self._options, self._allowance = options, allowance
         self._rest, self._half_range, self._radius = mirror.rest, mirror.limits.half_range, mirror.working_radius
         self._last: MapTaken | None = None
@@ -71,7 +71,7 @@ class BumpCheck:
             self._commanded += float(np.square(away - (away.mean() if len(away) > 1 else 0.0)).sum())
 
     def degaussed(self) -> None:
-        """Note that all actuators went through their whole range."""
+        """Note that all actuators have moved through their whole range."""
         self._moved = np.maximum(self._moved, self._half_range)
 
     def change(self, frame: MapTaken, interrupted: bool) -> str:

@@ -79,7 +79,7 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
 
 
 def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Event | Storing:
-    """The event in a frame; if it contains a map, that was taken with `setup`."""
+    """The event in a frame; a map in it was taken with `setup`."""
     try:
         values = _rebuilt(head["fields"], payload)
         if "record" in values:

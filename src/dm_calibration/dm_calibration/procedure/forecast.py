@@ -20,17 +20,17 @@ STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
 #: Error of moves after a run of one map per actuator, for a mirror never calibrated, m; it falls with the root of the
-#: number of maps. Median of 29 mirrors drawn at random (7646 to 7675 but 7650): 1.5 nm after 314 maps. One mirror in
-#: ten reached only 3.0 nm.
+#: number of maps. Median of 29 mirrors drawn at random (seeds 7646 to 7675 without 7650): 1.5 nm after 314 maps. One
+#: mirror in ten reached only 3.0 nm.
 TYPICAL_LAW = 4.5e-9
-#: If the error of a run exceeds the typical one by this factor, the law has most likely not been found yet.
+#: If the error in a run exceeds the typical one by more than this factor, the law has probably not been found yet.
 WORST_LAW = 2.2
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What to expect: duration, s; error of moves, m, as `HysteresisFit.held_out_max_zernike`, 0 = not known; number of
-    maps, 0 = all of the plan.
+    """Expected duration, s; expected error of moves, m, as `HysteresisFit.held_out_max_zernike`, 0 = not known; and
+    expected number of maps, 0 = all of the plan.
     """
 
     duration: float
@@ -38,10 +38,10 @@ class Forecast:
     maps: int = 0
 
     def accuracy(self, until: float, drawn: bool) -> str:
-        """A phrase on the accuracy to expect, compared with `until` (m; 0 = none asked for); "" = it is not known.
+        """A phrase on the expected accuracy, compared with the goal `until` (m; 0 = no goal); "" = it is not known.
 
         Args:
-            drawn: this mirror was never calibrated: the figure is that of mirrors drawn at random.
+            drawn: this mirror was never calibrated, so the value is that of mirrors drawn at random.
         """
         if not self.max_zernike > 0.0:
             return ""
@@ -65,7 +65,7 @@ def forecast(
 
     Args:
         settle_time: s between command and map.
-        earlier: calibration of the same mirror, which gives the error that its law leaves; None = there is none.
+        earlier: calibration of the same mirror, which gives the error of its law; None = there is none.
         map_time: s that the last map took; 0 = none was taken: estimated from `earlier`, else `guessed`.
         until: accuracy at which the run ends, m, if its plan may end early.
         guessed: s per map if nothing else is known.
@@ -101,7 +101,7 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
 
 
 def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
-    """Error of moves that one map would leave, m, from the `earlier` calibration of `mirror` or from mirrors like it.
+    """Error of moves after one map, m, extrapolated from the `earlier` calibration of `mirror` or from typical mirrors.
 
     The error is inversely proportional to the root of the number of maps.
     """
@@ -111,14 +111,14 @@ def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
 
 
 def expected_end(plan: Plan, done: int, reached: float, until: float, law: float) -> tuple[int, float]:
-    """The number of steps of `plan` after which `until` (m) is expected, or all, and the error expected then, m.
+    """The number of steps of `plan` after which the error `until` (m) is expected, or all, and the error expected then.
 
-    Once the law is found, the error is inversely proportional to the root of the number of maps. It falls suddenly when
-    the law is found, at a time that cannot be predicted: before, the expected error is 0 (not known).
+    The error falls suddenly when the law is found, at a time that cannot be predicted; before, the expected error is 0
+    (not known). From then on it is inversely proportional to the root of the number of maps.
 
     Args:
         done: steps so far.
-        reached: error with these, m.
+        reached: error after these, m.
         law: m, see `left_of_one_map`.
     """
     if reached > WORST_LAW * law / np.sqrt(done):
@@ -163,7 +163,7 @@ class GoodEnough:
         return bool(before) and min(last) > (1.0 - STANDSTILL) * min(before)
 
     def sentence(self, found: float) -> str:
-        """A sentence that compares what a run reached, which ended at `found` (m), with what was asked for."""
+        """A sentence that compares the error `found` (m) at the end of a run with the goal."""
         way = ", ".join(rounded(value * 1e9) for value in self.reached)
         parts = f" (part by part {way} nm)" if way else ""
         if found <= self._until:

@@ -1,4 +1,4 @@
-"""Whether a map can stand in one fit with those before it."""
+"""Check that a map may enter the same fit as the maps before it."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def check_comparable(
         aperture_tolerance: relative.
 
     Raises:
-        MeasurementError: the message names what differs, its value, and that of the others.
+        MeasurementError: the message names the property that differs, its value, and that of the other maps.
     """
     if different := _difference(measured, outcome, working_radius, aperture_tolerance):
         raise MeasurementError(ErrorCode.MAP_REJECTED, different)

@@ -1,7 +1,7 @@
 """The results of a run so far, as the sum of its events.
 
-Whatever happens in a run is an event. A live run takes its events one by one and keeps each on disk
-(:mod:`dm_calibration.procedure.run_journal`); an interrupted run is restored from the events kept. Both go through
+Everything that happens in a run is an event. A live run takes its events one by one and stores each on disk
+(:mod:`dm_calibration.procedure.run_journal`); an interrupted run is restored from the stored events. Both use
 :meth:`Outcome.take`, so they cannot differ.
 """
 
@@ -23,7 +23,7 @@ NOWHERE = (float("nan"), float("nan"))
 
 @dataclass(frozen=True)
 class Setup:
-    """The first map came: what all maps must share. Fields as in :class:`~dm_common.measurement.Measurement`."""
+    """The first map came; all maps must share these properties, see :class:`~dm_common.measurement.Measurement`."""
 
     points: SamplePoints
     wavelength: float
@@ -44,7 +44,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Segment:
-    """A known history of the actuators begins: with the degauss at the start, or at the resumption, of a run.
+    """A known history of the actuators begins, with the degauss at the start or the resumption of a run.
 
     Attributes:
         number: 0 for the first.
@@ -103,7 +103,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class Doubted:
-    """All but the first `kept` maps are in doubt, for `reason`; their steps are to be measured again."""
+    """All maps but the first `kept` are in doubt, for `reason`; their steps are to be measured again."""
 
     kept: int
     reason: str
@@ -119,7 +119,7 @@ class Outcome:
     Attributes:
         setup: properties that all maps share; None before the first map.
         dropped: "label: reason" of each map or state that could not be measured.
-        remarks: what was measured differently than requested.
+        remarks: deviations of the measurements from the request.
         centres: of the aperture on each map of `records`, m; NaN = not known.
     """
 
@@ -191,7 +191,7 @@ class Outcome:
         self.centres.append(centre)
 
     def _begin(self, number: int) -> None:
-        """Begin a segment. The last failures are forgotten and tried again: they may be why the run ended."""
+        """Begin a segment. The last failures are forgotten and tried again: the run may have ended because of them."""
         if number and self._failing:
             for _before, drop in self._drops[-self._failing :]:
                 self._given_up.pop(drop.step, None)

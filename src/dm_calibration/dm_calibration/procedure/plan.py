@@ -1,4 +1,4 @@
-"""What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1, hysteresis."""
+"""The steps of a calibration, in order: degauss, reference frames, pokes, surfaces of Table 1, hysteresis."""
 
 import math
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from dm_common.values import live_parameter, real, whole
 
 #: Commands between two reference frames of a hysteresis plan; few suffice, as most of the drift is modelled as creep.
 HYSTERESIS_REFERENCE_EVERY = 100
-#: A run with `until` may first end when there are enough commands to find a law, and then each time that their number
-#: has grown by this share, in multiples of the second number. Each part has its own check moves.
+#: A run with `until` may end as soon as there are enough commands to find a law, and then whenever their number has
+#: grown by the share NEXT_PART, in multiples of PART_STEP. Each part has its own check moves.
 NEXT_PART, PART_STEP = 0.25, 20
-#: Commands after which such a run ends in any case, unless the goal gives another number.
+#: Number of commands after which such a run ends in any case, unless the goal gives another number.
 LAST_PART_ENDS = 420
-#: Share of the neighbour limit that shapes as in use may take up, below 1 to leave room for rounding.
+#: Share of the neighbour limit that in-use shapes may take up, below 1 to leave room for rounding.
 IN_USE_ROOM = 0.999
 #: A mirror counts as one-sided if it is flat further from mid range than this share of the half range.
 ONE_SIDED = 0.5
 
 
 class PlanKind(StrEnum):
-    """What to measure; the values are those of dm_msgs/Calibrate."""
+    """The kinds of plans; the values are those in dm_msgs/Calibrate."""
 
     FULL = "full"
     POKES = "pokes"
@@ -44,8 +44,8 @@ class Step:
 
     Attributes:
         label: unique in the plan.
-        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. For a shape
-            as in use: signals that would make it if the figure were flat, see :func:`shape_in_use`.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved just before it is measured. For
+            an in-use shape: signals that would make it if the figure were flat, see :func:`shape_in_use`.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
         dwell: time to hold the shape beyond the settle time, s.
     """
@@ -69,7 +69,7 @@ class Step:
 
     @property
     def in_use(self) -> bool:
-        """Whether the step makes a shape as in use, about the flat mirror."""
+        """Whether the step makes an in-use shape, see `dm_calibration.hysteresis.excitation`."""
         return self.kind in (StepKind.IN_USE, StepKind.CHECK)
 
 
@@ -98,7 +98,7 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps in order, deviations from what was asked for, and the steps before which the run may end."""
+    """The steps in order, deviations from the request, and the steps before which the run may end."""
 
     kind: PlanKind
     steps: tuple[Step, ...]
@@ -176,10 +176,10 @@ def _parts(options: PlanOptions, actuators: int) -> list[int]:
 
 
 def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
-    """`step` with the signals that make its shape on a flat surface, as every request in use does.
+    """`step` with the signals that make its shape from a flat surface, as every request does.
 
-    The law is fitted and tested where it will be used: about the signals that flatten the mirror. If these are at an
-    end of the range, as for a membrane that can only be pulled, the levels are spread over the whole range instead.
+    The law is thus fitted and tested where it will be used: about the signals that flatten the mirror. If these are at
+    an end of the range, as for a membrane that can only be pulled, levels are spread over the whole range instead.
     """
     assert step.signals is not None
     limits = mirror.limits
@@ -190,8 +190,8 @@ def shape_in_use(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Ste
         away = step.signals - mirror.rest
         pattern = away - away.mean()
         size = max(float(np.abs(pattern).max()), 1e-12)
-        # The level of the step is a share of the room beside its pattern. Here it becomes the same share of the whole
-        # range, and the pattern is limited to the room that is left.
+        # The level of the step is a share of the range that its pattern leaves. Here it becomes the same share of the
+        # whole range, and the pattern is reduced to the range that remains.
         level = IN_USE_ROOM * room * float(np.clip(away.mean() / max(room - size, 1e-12), -1.0, 1.0))
         share = (IN_USE_ROOM * room - abs(level)) / size
         return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)

@@ -1,7 +1,7 @@
 """The calibration procedure: follow a plan, command, settle, measure, and lose no good map because of a bad one.
 
-It is independent of ROS: the mirror and the instrument are reached through callables. An interrupted run continues from
-its maps with a degauss, since the history of the actuators is not known meanwhile, and a reference frame.
+It is independent of ROS: mirror and instrument are a `dm_common.measurement.Bench`. An interrupted run continues with a
+degauss, since the history of the actuators is no longer known, and with a reference frame.
 """
 
 import time
@@ -59,7 +59,7 @@ class ProcedureOptions:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of the procedure: step `done` of `steps`."""
+    """Progress of the procedure: `done` of `steps` steps are done."""
 
     label: str
     kind: StepKind
@@ -90,9 +90,9 @@ class Procedure:
         """Prepare a run.
 
         Args:
-            model: solves the surfaces with a prescribed shape; None = fit one to the maps of this run before the first
-                such surface.
-            outcome: of an interrupted run of the same plan; None = begin.
+            model: for solving the surfaces with a prescribed shape; None = fit one to the maps of this run before the
+                first such surface.
+            outcome: of an interrupted run of the same plan, to be continued; None = begin a new run.
             keep: called with each event before it takes effect; an exception ends the run.
             guard: called before each step; an exception ends the run.
             enough: called at the steps where the plan may end; True ends the run.
@@ -109,7 +109,7 @@ class Procedure:
         self._bump = BumpCheck(self._options.bump, mirror, self._options.fit.hysteresis_allowance)
         for record, centre in zip(self.outcome.records, self.outcome.centres, strict=True):
             self._bump.take(MapTaken(record, centre=centre))
-        self._swung = False  # since the last map: degaussed after an interruption, and perhaps moved or realigned
+        self._swung = False  # degaussed after an interruption, perhaps also realigned, since the last map
 
     def run(self) -> Outcome:
         """Go through all steps that are not done yet.
@@ -117,7 +117,7 @@ class Procedure:
         The caller returns the mirror to rest afterwards, however this ends.
 
         Raises:
-            Cancelled: `cancelled()` became true; noticed within one step.
+            Cancelled: `cancelled()` became true, which is noticed within one step.
             Refusal: the mirror failed, the interferometer gave no map for several states in a row, or the mirror
                 was bumped.
         """
@@ -177,7 +177,7 @@ class Procedure:
         self._guard()
 
     def _note(self, event: Event) -> None:
-        """Write the event to disk before it takes effect, so that nothing counts that could get lost."""
+        """Write the event to disk before it takes effect, so that nothing that counts can get lost."""
         self._keep(event)
         self.outcome.take(event)
 
@@ -238,7 +238,7 @@ class Procedure:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
         if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._swung):
-            taken = self._map(label, step, number, applied)  # bad map, or moved mirror: a second map decides
+            taken = self._map(label, step, number, applied)  # a bad map or a moved mirror: a second map decides
             if suspicion := self._bump.change(taken, self._swung):
                 self._stop_bumped(label, suspicion)
         self._note(taken)
@@ -291,7 +291,7 @@ class Procedure:
         records = self.outcome.records
         if self._plan.kind is not PlanKind.HYSTERESIS or not records:
             return
-        # A reference frame without a map becomes an ordinary command: it serves neither the figure nor the bump check.
+        # A reference frame without a map becomes an ordinary command: it helps neither the figure nor the bump check.
         kind = StepKind.EXCITATION if step.kind is StepKind.REFERENCE else step.kind
         told = {"label": step.label, "kind": kind.value, "step": number, "signals": step.signals, "applied": applied}
         self._note(without_map(records[-1], **told))

@@ -1,6 +1,6 @@
-"""A calibration repeated from a recording: the same procedure on a bench that replays what was recorded.
+"""A calibration repeated from a recording: the same procedure on a bench that replays it.
 
-A recording holds the reports of the driver, the maps of the interferometer, and the plan, which is part of the
+A recording contains the reports of the driver, the maps of the interferometer, and the plan, as part of the action's
 feedback. Independent of ROS.
 """
 
@@ -29,7 +29,7 @@ class Move:
     """One move that the driver completed.
 
     Attributes:
-        stamp_ns: time at which its end was written to the electronics.
+        stamp_ns: time at which its last signals were written to the electronics, ns.
         requested, applied: (N,) as the driver reported.
     """
 
@@ -46,7 +46,7 @@ class RecordedRun:
     Attributes:
         maps: in the order of their stamps.
         plan: as made by :func:`plan_text`.
-        model: of the calibration in use when the run began; None = none.
+        model: influence function of the calibration in use when the run began; None = there was none.
     """
 
     mirror: Mirror
@@ -121,7 +121,7 @@ def planned(text: str, mirror: Mirror) -> tuple[Plan, int]:
 
 
 def _difference(plan: Plan, moves: Sequence[Move], end: int) -> str:
-    """Where `moves` differ from those of `plan` before the step `end`; "" = nowhere. Solved steps match any move."""
+    """How `moves` differ from `plan` before the step `end`, as text; "" = not at all. Solved steps match any move."""
     for step, move in zip(plan.steps[:end], moves, strict=False):
         if step.kind is StepKind.DEGAUSS:
             if not move.degauss:

@@ -27,9 +27,9 @@ class OpenRun:
     """A run with its journal.
 
     Attributes:
-        storing: the calibration as which it may already have been stored; None = it had not come that far.
+        storing: the calibration that may already have been stored from it; None = the run had not come that far.
         resumed: a sentence if an earlier run is resumed; "" = a new run begins.
-        notes: what was done with other unfinished runs.
+        notes: sentences on the fate of other unfinished runs.
     """
 
     journal: RunJournal
@@ -59,21 +59,21 @@ def identity_of(
 
     Args:
         settings: of the goal, besides the plan's options.
-        driver: the driver's facts on wiring and limits.
+        driver: facts on wiring, electronics and voltages, from the driver.
     """
     described = [(step.label, step.kind.value, step.dwell) for step in plan.steps]
     signals = [step.signals for step in plan.steps if step.signals is not None]
     steps = hashlib.sha256(json.dumps(described).encode()).hexdigest()
     facts = {
         "plan": plan.kind.name,
-        # All other options that the plan uses show in its steps.
+        # All other options of the plan are part of its steps.
         "until": options.until,
         "plan_sha256": _hash(*signals) + steps,
         "mirror": mirror_facts(mirror),
         "settings": dict(settings),
         "driver": dict(driver),
     }
-    # Through JSON, as when read from a file: tuples become lists.
+    # Through JSON, which turns tuples into lists, as when the facts are read from a file.
     result: dict[str, Any] = json.loads(json.dumps(facts))
     return result
 
@@ -127,7 +127,7 @@ def open_run(
 
 
 def _reason_against(found: Kept, plan: Plan, age_max: float, fresh: bool, now_ns: int) -> str:
-    """Why an unfinished run is not to be resumed; "" = it is."""
+    """The reason why an unfinished run is not resumed; "" = it is."""
     age = 1e-9 * (time.time_ns() - found.last_ns)
     if fresh:
         return "a fresh run was asked for"

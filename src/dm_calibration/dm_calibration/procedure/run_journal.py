@@ -2,8 +2,8 @@
 
 A folder ``<id>/`` holds ``manifest.json`` (plan, settings, mirror, software; written once and atomically) and
 ``events`` (appended and synced frame by frame). A frame torn by a power cut is cut off when the run is resumed. Only
-coefficients and samples are kept, some kilobytes a map; the full maps stay in the interferometer's folder, and the
-journal holds their names and hashes.
+coefficients and samples are kept, some kilobytes per map; the full maps stay in the interferometer's folder, and the
+journal contains their names and hashes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Kept:
         folder: of the journal; its name is that of the run.
         maps: number of maps measured, including those in doubt.
         last_ns: wall time of the last write, ns since the epoch.
-        storing: the calibration that was about to be stored; None = the run had not come that far.
+        storing: the calibration about to be stored; None = the run had not come that far.
         torn: number of bytes after the last whole frame.
     """
 

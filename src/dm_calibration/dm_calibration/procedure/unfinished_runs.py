@@ -1,7 +1,7 @@
-"""The folder of interrupted runs: which of them a new goal resumes, and what is done with the others.
+"""The folder of interrupted runs: which of them a new goal resumes, and what happens to the others.
 
-A run is resumed if plan, settings and mirror are the same and it is not too old. A run that is not to be resumed is set
-aside, never deleted at once: its maps may still be wanted. Only one node at a time works in the folder.
+A run is resumed if plan, settings and mirror are the same and it is not too old. A run that will not be resumed is set
+aside, and never deleted at once: its maps may still be wanted. Only one node at a time works in the folder.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from dm_common.errors import ErrorCode, Refusal
 FOLDER = "unfinished"
 #: Suffix of runs that were set aside.
 ASIDE = ".set-aside"
-#: Number of runs set aside that are kept, the newest.
+#: Number of runs set aside that are kept (the newest).
 ASIDE_MAX = 5
-#: Number of runs with other settings that are kept for their own goals, the newest.
+#: Number of runs with other settings that are kept (the newest), for goals with those settings.
 WAITING_MAX = 20
 
 _LOCK = ".lock"

@@ -1,1 +1,1 @@
-"""Later maps keep a calibration true: gains and figure by recursive least squares."""
+"""Updates of a calibration by later maps: gains and figure by recursive least squares."""

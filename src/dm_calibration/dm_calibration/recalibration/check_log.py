@@ -1,4 +1,4 @@
-"""The log of checks beside a calibration, ``<id>.checks.csv``: what each later map has shown of it."""
+"""The log of checks beside a calibration, ``<id>.checks.csv``: the comparison of each later map with it."""
 
 import csv
 import math
@@ -18,7 +18,7 @@ class Check:
 
     Attributes:
         time: of the map, s since the epoch.
-        accepted: 1 = it agreed and was taken in.
+        accepted: 1 = it agreed and updated the calibration.
         max_zernike: largest difference of a coefficient beyond tilt, m.
         rms: of the difference in sag, m.
         surprise: difference relative to its expected size.
@@ -57,7 +57,7 @@ def append_check(file: Path, check: Check) -> None:
 
 
 def read_checks(file: Path) -> list[Check]:
-    """The checks in a log, oldest first; lines that a power cut has torn are left out. No file = none."""
+    """The checks in a log, oldest first, without lines torn by a power cut; none if there is no file."""
     found = []
     try:
         lines = file.read_text(errors="replace").splitlines()

@@ -1,4 +1,4 @@
-"""Find the single actuators that explain a disagreeing map, how probable that is, and where they stand."""
+"""Search for single actuators that explain a disagreeing map, with their positions and probabilities."""
 
 from collections.abc import Mapping
 
@@ -20,11 +20,11 @@ from dm_common.optics.zernike import PISTON_TILT, basis
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 #: Prior standard deviation of the displacement of a faulty actuator, in effective signal.
 DISPLACED_SIGMA = 0.5
-#: Least signal at which a weak actuator can be distinguished from a displaced one, also least move of one without a
-#: response in the calibration; largest share of its move that a dead actuator still makes.
+#: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
+#: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
 TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
-#: Least displacement, in effective signal, at which an actuator counts as failed: where the law errs in use, maps seem
-#: to show displacements of up to 0.03.
+#: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
+#: displacements of up to 0.03.
 FAILED_SIGNAL = 0.05
 #: From data sheets of piezo mirrors: rise of the surface over an actuator per unit signal, m, and width of the bump
 #: (standard deviation, in pitches).
@@ -41,7 +41,7 @@ def without_response(calibration: Calibration) -> Bools:
 def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -> Floats:
     """`gain` (R, N) per unit of effective signal, with that of a typical piezo mirror for actuators without a response.
 
-    For these the fit contains only noise, with which no map could show that they move.
+    For these the fit contains only noise, so no map could show that they move.
     """
     silent = without_response(calibration)
     if not silent.any() or silent.size < 2:  # no neighbour whose distance gives the width of a bump
@@ -91,8 +91,8 @@ def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools) -
     """(N,) probability that each actuator alone causes the difference `white` (R,), against any other cause.
 
     An actuator may be anywhere in its range. A cause other than an actuator changes all values, by an unknown amount
-    estimated from `white`; for a `silent` actuator, whose bump is not known, the same holds for what it leaves. The
-    prior is one half for all actuators together, and one half for other causes.
+    estimated from `white`; for a `silent` actuator, whose bump is not known, the same holds for its residual. The prior
+    is one half for all actuators together, and one half for other causes.
     """
     size, whole = len(white), white @ white
     precision = 1.0 / DISPLACED_SIGMA**2
@@ -112,7 +112,7 @@ def _of_anything(square: Floats, size: int) -> Floats:
 def displacement(
     innovation: Floats, gain: Floats, factor: tuple[Floats, bool], actuators: list[int]
 ) -> tuple[Floats, Floats]:
-    """Distance of each of `actuators` from where it should stand, in effective signal, and its standard deviation.
+    """Displacement of each of `actuators` from its expected position, in effective signal, and its standard deviation.
 
     By generalised least squares; other args as those of :func:`displaced_actuators`.
     """
@@ -122,7 +122,7 @@ def displacement(
 
 
 def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bools, silent: Bools) -> str:
-    """Describe what a disagreeing map shows, where actuators should stand at `expected` (N,).
+    """Describe what a disagreeing map shows, if actuators should stand at `expected` (N,).
 
     Args:
         given_up: (N,) actuators that are already known not to move any more.
@@ -157,11 +157,11 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
 def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:
     """Largest coefficient error (m) over all other shapes if actuators stay where a map shows them.
 
-    The error of a stuck actuator is the move it is asked to make, which is largest to the far end of the range.
+    The error of a stuck actuator is the move that it should make, which is largest to the far end of the range.
 
     Args:
-        displaced: as found by :func:`displaced_actuators`; only those that failed count.
-        expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
+        displaced: as found by :func:`displaced_actuators`; only failed actuators count.
+        expected: (N,) effective signals at which actuators should stand, within about -1 .. +1.
         zernike: (K, N) m per unit of effective signal.
     """
     furthest = np.zeros(len(expected))

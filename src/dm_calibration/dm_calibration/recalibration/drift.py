@@ -1,4 +1,4 @@
-"""What later maps have shown of a calibrated mirror."""
+"""The drift of a calibrated mirror, as estimated from later maps."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,14 +12,14 @@ from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.recipes import GOES_ON_WITHOUT
 from dm_common.values import live_parameter, parameter, real, whole
 
-#: Prior standard deviations of the changes for 1 K, as long as no map was taken at another temperature: relative change
-#: of all gains, and change of the figure, m rms.
+#: Prior standard deviations of changes per K, valid until a map is taken at another temperature: relative change of all
+#: gains, and change of the figure, m rms.
 WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 
 
 @dataclass(frozen=True)
 class UpdateOptions:
-    """Which maps are taken, and how far they may change the calibration.
+    """Which maps are used, and how far they may change the calibration.
 
     Attributes:
         gain_rate, figure_rate: standard deviations. Half of the variance of gains is common to all actuators.
@@ -50,7 +50,7 @@ class UpdateOptions:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What later maps have shown of a mirror. Never changed in place.
+    """Drift of a mirror since its calibration, as estimated from later maps. Never changed in place.
 
     Attributes:
         gain: (N,) relative changes.
@@ -59,13 +59,13 @@ class Drift:
         crept: (R,) m rms, change of the figure by slow creep at `stamp_ns`, in reduced values; it fades.
         covariance: (N + 3 R + 1, N + 3 R + 1) of gain, offset, thermal and crept.
         stamp_ns: time for which these values hold.
-        revision: number of maps taken in.
+        revision: number of maps used.
         checked_ns: stamp of the last of them; 0 = none.
-        surprising: number of latest maps, in a row, that disagreed.
-        disagreement: largest error (m) shown by these maps, or made in other shapes by the faulty actuators they show.
-        evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and of their products
-            with the measured changes; first row: gain and figure, second row: changes by temperature.
-        stuck: (N,) effective signals at which actuators are stuck; NaN = it moves.
+        surprising: number of the latest maps, in a row, that disagreed.
+        disagreement: largest error (m) in these maps, or in other shapes by the faulty actuators that they show.
+        evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and sum of their
+            products with the measured changes; first row: gain and figure, second row: changes by temperature.
+        stuck: (N,) effective signals at which actuators are stuck; NaN = the actuator moves.
         temperatures: (3,) degC: reference for gain and offset, lowest and highest of the maps; NaN = not known.
     """
 
@@ -104,12 +104,12 @@ class Drift:
         return float(np.nan_to_num(np.abs(self.temperatures - self.temperatures[0]).max()))
 
     def reached(self, effective: Floats) -> Floats:
-        """Where the actuators stand when `effective` (N,) is asked for."""
+        """Where the actuators stand when `effective` (N,) is commanded."""
         return np.where(np.isnan(self.stuck), effective, self.stuck)
 
     @property
     def given_up(self) -> str:
-        """The actuators that do not move any more and where they stand, as a sentence; "" = all move."""
+        """Sentence on the actuators that no longer move and where they stand; "" = all move."""
         indices = np.flatnonzero(np.isfinite(self.stuck))
         places = ", ".join(f"{index + 1} (stands at {self.stuck[index]:+.2f})" for index in indices)
         return f"{GOES_ON_WITHOUT}{'s' if indices.size > 1 else ''} {places}" if places else ""
@@ -144,7 +144,7 @@ class Drift:
 
 
 class Displaced(NamedTuple):
-    """A displaced actuator: by how much effective signal, and how probable that is.
+    """A displaced actuator: its displacement in effective signal, and the probability that it is displaced.
 
     The alternatives are any other actuator and a map that is bad everywhere.
     """
@@ -162,8 +162,8 @@ class Comparison:
         rms: m rms of the difference in sag, piston and tilt removed.
         surprise: difference relative to its expected size, about 1 when all is well: the larger of the rms over all
             values and the largest single value relative to the largest expected among as many.
-        displaced: by index, the actuators that cause the difference, the worst first, where a few of them explain it,
-            such as one that is stuck.
+        displaced: by index, the worst first, the actuators that cause the difference, if a few of them (such as one
+            that is stuck) explain it.
     """
 
     max_zernike: float
@@ -174,7 +174,7 @@ class Comparison:
 
 
 def surprise_of(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:
-    """`innovation` (R,) over its `expected` covariance (R, R)."""
+    """Size of `innovation` (R,) relative to that by its `expected` covariance (R, R), with Cholesky factor `factor`."""
     size = len(innovation)
     together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
     # Median of the largest absolute value of `size` normal numbers.

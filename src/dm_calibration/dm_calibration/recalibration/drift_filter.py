@@ -2,19 +2,19 @@
 
 In the reduced values of a map (:class:`~dm_calibration.hysteresis.responses.Reduction`) a calibration predicts ``v = v0
 + V e`` from the effective signals e. Later it is ``v = v0 + d + c + V diag(e) (1 + g)``: gains have changed by the
-shares g, the figure by d and by creep c slower than the run of the calibration shows. Where maps hold a temperature, t
+shares g, the figure by d and by creep c slower than the run of the calibration shows. If maps have a temperature, t
 above that of the calibration, ``k t V e + h t`` is added, with constants k of all gains and h of the figure. Creep
-fades, and gains and figure are random walks, so what is known of them fades with time. Each map is a step of the Kalman
+fades, and gains and figure are random walks, so knowledge of them fades with time. Each map is a step of the Kalman
 filter, which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
 
-An estimate of drift contains noise, and on a mirror that does not drift it is nothing but noise: used as it is, it
-would make the calibration worse. So each map first tests the estimate from earlier maps: the predicted change is
-compared with the measured one. Only the share of the estimate that this evidence supports is used (the positive-part
-estimate of a regression through the origin, less one standard error), and none of it before a second shape was
-measured. Changes by temperature are tested separately in the same way.
+An estimate of drift contains noise; on a mirror that does not drift it is nothing but noise, and would make the
+calibration worse. So each map first tests the estimate from earlier maps: the predicted change is compared with the
+measured one. Only the share of the estimate that this evidence supports is used (the positive-part estimate of a
+regression through the origin, less one standard error), and none of it before a second shape was measured. Changes by
+temperature are tested separately in the same way.
 
-A map that departs further from its prediction than chance allows is a bad map, or the mirror has changed: the caller
-must not take it in.
+If a map differs from its prediction by more than chance allows, either the map is bad or the mirror has changed: the
+caller must not use it.
 """
 
 from dataclasses import replace
@@ -43,11 +43,11 @@ DAY_S = 86400.0
 #: Least variance of a value that is attributed to the noise of its map: as a share of the scatter of the calibration's
 #: maps, and in m^2, for maps without any noise.
 NOISE_SHARE_MIN, NOISE_MIN = 0.1, 1e-24
-#: Factor on earlier evidence for each further map: evidence is of the last thirty maps or so.
+#: Factor on earlier evidence for each further map: evidence covers about the last thirty maps.
 EVIDENCE_KEPT = 0.97
 #: An actuator counts as failed beyond this many standard deviations from where it should stand.
 DISPLACED_SIGMAS = 4.0
-GAIN_SIGMA_MAX = 0.05  # largest relative standard deviation of a gain, also of actuators that hardly show
+GAIN_SIGMA_MAX = 0.05  # largest relative standard deviation of a gain, even of actuators with little response
 #: Decades of time for which a stuck actuator creeps on, as after a move across the range: with the factor on every
 #: bound (1.4), and a map some ten seconds after it failed, that covers about two hours.
 STUCK_DECADES = 2.0
@@ -79,7 +79,7 @@ class DriftFilter:
     """Follows one mirror's :class:`Drift`.
 
     Args:
-        calibration: its maps show how far a map scatters about its prediction.
+        calibration: its maps give the scatter of a map about its prediction.
         options: how fast a mirror drifts, and the error of effective signals without a hysteresis model.
 
     Raises:
@@ -132,11 +132,11 @@ class DriftFilter:
         """Compare a map with what `drift` predicts for it; nothing is changed.
 
         Args:
-            measured: a map older than the drift counts as of the time of the drift. If the calibration has no
+            measured: a map older than the drift is dated to the time of the drift. If the calibration has no
                 temperature, the first one measured with a map takes its place.
-            effective: (N,) effective signals at its time.
-            repeat: number of earlier maps of this very state. The error of the law is the same in all of them and does
-                not average out, so repeats count for less and less.
+            effective: (N,) effective signals at the time of the map.
+            repeat: number of earlier maps of the same state. The error of the law is the same in all of them and does
+                not average out, so repeats have less and less weight.
         """
         drift = self._at(drift, measured.stamp_ns)
         seen = self._innovation(drift, measured, effective, repeat)
@@ -192,7 +192,7 @@ class DriftFilter:
         Args as of :meth:`compare`.
 
         Raises:
-            MapNotUsableError: an actuator is where it should be, within the error of the map.
+            MapNotUsableError: an actuator stands where it should, within the error of the map.
         """
         seen = self._innovation(self._at(drift, measured.stamp_ns), measured, effective, repeat)
         away, sigma = displacement(seen.shown - seen.predicted - seen.warm, self._gain, seen.factor, actuators)
@@ -233,7 +233,7 @@ class DriftFilter:
         predicted, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
         used = drift.trust * predicted + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
-        # Uncertainty of the calibration's influence function that is not one of gains.
+        # Uncertainty of the calibration's influence function other than that of gains.
         leverage = effective @ self._fit.signal_covariance @ effective
         expected = design @ drift.covariance @ design.T + (1.0 + repeat) ** 2 * self._law
         creeping = 0.5 * self._gain * self._creeping_on(drift)

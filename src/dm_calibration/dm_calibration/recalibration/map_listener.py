@@ -30,16 +30,16 @@ from dm_common.ros.lifecycle import OK, WARN, ManagedNode
 from dm_common.ros.worker import WorkerService
 from dm_common.values import wholes, without_figures
 
-#: Wall time for the driver to report after a map, s (it does so every 0.5 s).
+#: Longest wait for a report of the driver after a map, s of wall time (it reports every 0.5 s).
 REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
-#: Most maps kept that still lack a message, and maps remembered so that none counts twice.
+#: Number of maps kept that still lack a message, and of maps remembered so that none counts twice.
 INCOMPLETE_KEPT, MAPS_KEPT = 8, 64
 
 
 class MapListener:
-    """Passes arriving maps to :class:`RecalibrationManager` and publishes what they change.
+    """Passes arriving maps to :class:`RecalibrationManager` and publishes the changes.
 
     Args:
         busy: whether a calibration is running; its maps are not taken.
@@ -56,7 +56,7 @@ class MapListener:
         self._node, self._values = node, values
         self._manager, self._services, self._busy = manager, services, busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
-        self.history = AppliedHistory()  # of this mirror; the node has it begin anew for another one
+        self.history = AppliedHistory()  # of this mirror; the node restarts it for another one
         self._followed: Any = None  # law and mid range
         self._turn = threading.Lock()  # one map at a time; held while measuring and judging
         self._exchange = threading.Lock()  # a map is compared under the law of its effective signals
@@ -80,7 +80,7 @@ class MapListener:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, calibration: Calibration | None) -> None:
-        """Keep `calibration` true from now on, and follow its hysteresis about the present mid range of the mirror."""
+        """Update `calibration` by maps from now on, and follow its hysteresis about the mirror's present mid range."""
         same = calibration is getattr(self._updates.in_use, "calibration", None)
         middle = float(mirror.rest[0]) if (mirror := self._manager.mirror) is not None else 0.0
         law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
@@ -94,25 +94,25 @@ class MapListener:
             self._updates.folder = self._manager.store.folder
             try:
                 remark = self._updates.begin(calibration)
-            except ValueError as error:  # use it all the same, without updates
+            except ValueError as error:  # use it nevertheless, without updates
                 remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
         if remark:
             self._node.get_logger().warning(remark)
 
     def amend(self, message: CalibrationMsg) -> None:
-        """Add what later maps have shown to the message of the calibration in use."""
+        """Add the updates by later maps to the message of the calibration in use."""
         self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
         if (kept := self._updates.in_use) is not None:
             put_updates(message, kept, self._temperatures.published(), self._doubts(), self._updates.mirror_changed)
 
     @property
     def recipes_in_doubt(self) -> bool:
-        """Whether recipes may not hold any more: some actuators are given up, or maps disagree."""
+        """Whether recipes may no longer hold: some actuators are given up, or maps disagree."""
         kept = self._updates.in_use
         return kept is not None and bool(kept.drift.given_up or kept.drift.surprising)
 
     def _doubts(self) -> list[str]:
-        """Sentences on why the calibration may not hold any more."""
+        """Sentences on why the calibration may no longer hold."""
         doubts = [*self._updates.doubts, *self._updates.widened]
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
@@ -134,7 +134,7 @@ class MapListener:
         return self._age_s > self._values["updates.stale_after"]
 
     def tick(self) -> None:
-        """Publish what is due; called about once a second by the node."""
+        """Publish changes that are due; called about once a second by the node."""
         stale, kept = self._stale, self._updates.in_use
         warmed = kept is not None and kept.drift.thermal_trust > 0.0 and self._temperatures.changed
         if self._dirty or stale != self._was_stale or warmed:
@@ -176,12 +176,12 @@ class MapListener:
         except EXPECTED as error:
             self._refuse(str(error))
             log.info(f"map not taken: {error}", throttle_duration_sec=10.0)
-        except Exception as error:  # whatever one map does, the next one must be taken
+        except Exception as error:  # no map may keep the next one from being taken
             self._refuse(f"{type(error).__name__}: {error}")
             log.error(f"map not taken: {type(error).__name__}: {error}")
 
     def _judge(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
-        """Compare a map with the calibration and take it in; `_turn` must be held.
+        """Compare a map with the calibration, and update it if they agree; `_turn` must be held.
 
         Args as of :meth:`RecalibrationManager.take`.
 
@@ -244,10 +244,10 @@ class MapListener:
                 purpose = "a map is compared with the calibration (service update_calibration)"
                 try:
                     stack.enter_context(self._services.held(request, purpose))
-                except Refusal as refusal:  # go on with a dry run: a map of a moving mirror is not usable anyway
+                except Refusal as refusal:  # a dry run goes on: if the mirror moves, the map is refused anyway
                     if not (request.dry_run and refusal.error_code == ErrorCode.BUSY):
                         raise
-                # A map is refused unless the mirror rests before and after it; corrections of creep wait that long.
+                # A map is refused unless the mirror rests before and after it, which corrections of creep may delay.
                 becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
                 try:

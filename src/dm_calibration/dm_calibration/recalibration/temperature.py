@@ -10,7 +10,7 @@ from sensor_msgs.msg import Temperature
 
 from dm_common.messages import seconds
 
-#: Readings kept: an hour of one a second.
+#: Number of readings kept: one hour at one per second.
 KEPT = 3600
 #: Change of temperature after which everything that depends on it is published again, K.
 WARMED_K = 0.05

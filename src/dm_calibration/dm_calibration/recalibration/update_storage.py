@@ -15,11 +15,11 @@ from dm_common.atomic_write import write_whole
 SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1
 
-#: Arrays of finite numbers, and those in which NaN has a meaning.
+#: Arrays of finite numbers, and arrays in which NaN has the given meaning.
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
-#: Figures missing in older files, with the values that give the trust of exactly 1 with which these were used.
+#: Figures missing in older files, with values that give a trust of exactly 1, with which those updates were used.
 _FIGURES = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0, "disagreement": 0.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
@@ -29,8 +29,8 @@ class UpdatesFileError(ValueError):
 
 
 def _head(calibration: Calibration) -> dict[str, Attribute]:
-    """What ties a file to its calibration: id, and SHA-256 over what updates change (influence function and figure),
-    points and hysteresis. Recipes and notes are left out, since they may be added later.
+    """Attributes that tie a file to its calibration: its id, and a SHA-256 over influence function, figure, points and
+    hysteresis. Recipes and notes are left out, since they may be added later.
     """
     columns: dict[str, Column] = {name: getattr(calibration.fit, name) for name in _RESULT}
     columns |= {f"points/{name}": getattr(calibration.fit.points, name) for name in ("x", "y", "weight")}
@@ -43,7 +43,7 @@ def write_updates(path: Path, calibration: Calibration, updates: Drift) -> None:
     """Write `updates` of `calibration`.
 
     Raises:
-        OSError: it could not be written; the file that was there before still is.
+        OSError: it could not be written; the previous file is unchanged.
     """
     columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, *_OR_NAN)}
     attributes: dict[str, Attribute] = {
@@ -58,7 +58,7 @@ def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | N
     """The updates of `calibration` in a file; None when there is no file.
 
     Args:
-        like: has arrays of the required shapes, and the values of those that older files lack.
+        like: its arrays have the required shapes, and the values for arrays that older files lack.
 
     Raises:
         UpdatesFileError: damaged, foreign, or of another calibration.

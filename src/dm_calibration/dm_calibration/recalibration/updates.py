@@ -1,6 +1,6 @@
-"""The calibration in use, kept true by maps that arrive later: which are taken, what they change, what is stored.
+"""Updates of the calibration in use by later maps: which maps are used, what they change, and storage.
 
-The calibration's own file is never changed. What later maps have shown is stored beside it, in ``<id>.updates.hdf5``.
+The calibration's own file is never changed. Updates are stored beside it, in ``<id>.updates.hdf5``.
 """
 
 import threading
@@ -25,20 +25,20 @@ from dm_common.atomic_write import storing
 from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 
-#: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
+#: Time within which all maps of a mirror that has not moved share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
-#: Times of moves that differ by less than this belong to the same move, s.
+#: Times of moves that differ by less than this, s, belong to the same move.
 SAME_MOVE_S = 0.2
 SUFFIX = ".updates.hdf5"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a map.
+    """Result of the comparison of a map.
 
     Attributes:
-        accepted: it agreed well enough to be taken in.
-        reason: why not, or what it showed.
+        accepted: it agreed well enough to update the calibration.
+        reason: why not, or what the map showed.
     """
 
     accepted: bool
@@ -48,7 +48,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class InUse:
-    """The calibration in use and what later maps have shown of it. Never changed in place.
+    """The calibration in use and its drift, as estimated from later maps. Never changed in place.
 
     Attributes:
         repeats: number of maps of the present shape, which the mirror has had since `since` (s); the first of them was
@@ -67,11 +67,11 @@ class RecalibrationManager:
     """Updates of the calibration in use; every method may be called from any thread.
 
     Args:
-        options: asked for at every map.
+        options: called for every map.
 
     Attributes:
         in_use: None without a calibration; replaced as a whole.
-        ignored: why what is stored of earlier maps is not used; "" = it is.
+        ignored: why the stored updates are not used; "" = they are.
     """
 
     def __init__(self, folder: Path, options: Callable[[], UpdateOptions]) -> None:
@@ -88,7 +88,7 @@ class RecalibrationManager:
 
     @property
     def doubts(self) -> list[str]:
-        """Sentences on why the calibration may not hold any more, or only in part."""
+        """Sentences on why the calibration may no longer hold, or only in part."""
         doubts, kept = [], self.in_use
         if kept is not None and self.mirror_changed:
             doubts.append(
@@ -111,10 +111,10 @@ class RecalibrationManager:
         return [f"The last {last} with this calibration: bounds are wider until one agrees."]
 
     def begin(self, calibration: Calibration | None) -> str:
-        """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
+        """Update `calibration` from now on, beginning with its stored updates. Returns why those are not used, or "".
 
         Raises:
-            ValueError: the calibration's maps make no sense.
+            ValueError: the time stamps of the calibration's maps run backwards.
         """
         with self._lock:
             self.in_use, self.ignored = None, ""
@@ -132,11 +132,11 @@ class RecalibrationManager:
     def take(
         self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
     ) -> Verdict:
-        """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
+        """Compare a map of the mirror in the state `settled` with the calibration, and update that if they agree.
 
         Args:
-            without: indices of actuators that do not move any more; from now on they have no effect and stand where the
-                map shows them.
+            without: indices of actuators that no longer move; from now on they have no effect and stand where the map
+                shows them.
 
         Raises:
             Refusal: no calibration is in use.
@@ -199,7 +199,7 @@ class RecalibrationManager:
             self.in_use, self.ignored = InUse(kept.calibration, kept.filter, drift), ""
 
     def kept(self) -> InUse:
-        """What is in use, with a filter of the present options. Raises Refusal if no calibration is in use."""
+        """`in_use`, with a filter of the present options. Raises Refusal if no calibration is in use."""
         with self._lock:
             if (kept := self.in_use) is None:
                 raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
@@ -212,7 +212,7 @@ class RecalibrationManager:
 
 
 def _repeats(kept: InUse, stamp_ns: int, settled: SettledState) -> int:
-    # While a shape is held against creep, the correction found to have begun it is not always the same one.
+    # While a shape is held against creep, different corrections may be found to have begun it.
     same = abs(settled.since - kept.since) < SAME_MOVE_S and 1e-9 * (stamp_ns - kept.first_ns) < REPEAT_S
     return kept.repeats if same else 0
 
@@ -221,7 +221,7 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
     """Refuse a map that cannot be compared with `calibration`.
 
     Raises:
-        MapNotUsableError: naming what differs, its value and what is allowed.
+        MapNotUsableError: the message names the property that differs, its value and what is allowed.
     """
     terms = calibration.maps.terms
     if measured.coefficients.shape != (terms,):

@@ -1,1 +1,1 @@
-"""Regression of the surface control error on what is known of a surface ([1], section 3.1)."""
+"""Regression of the surface control error on known properties of a surface ([1], section 3.1)."""

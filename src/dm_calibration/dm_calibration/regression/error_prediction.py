@@ -18,9 +18,9 @@ from dm_common.values import reals, without_figures
 
 
 class ErrorPrediction:
-    """The regression in use. Both services may be called from threads of their own.
+    """The regression in use. Both services may run in threads of their own.
 
-    A regression belongs to one calibration: for another one in use, the first request fits one with the defaults.
+    A regression belongs to one calibration. After a change of calibration, the next prediction fits a default one.
     """
 
     def __init__(self, manager: CalibrationManager, values: Mapping[str, Any]) -> None:
@@ -28,7 +28,7 @@ class ErrorPrediction:
         self._manager, self._values = manager, values
         self._lock = threading.Lock()
         self._of = ""
-        self._predictor: ErrorPredictor | Refusal | None = None  # or why there is none, kept for further requests
+        self._predictor: ErrorPredictor | Refusal | None = None  # Refusal: why none can be fitted
 
     def fit(self, request: Any, response: Any) -> Any:
         """Serve `fit_regression`.
@@ -75,7 +75,7 @@ class ErrorPrediction:
         if isinstance(predictor, Refusal):
             if predictor.error_code != ErrorCode.TOO_FEW_MAPS:
                 raise Refusal(predictor.error_code, str(predictor))
-            # From pokes alone, for instance: nothing to warn of, since the controller asks about every calibration.
+            # E.g. a calibration of pokes alone. No warning, since the controller requests this of every calibration.
             response.error_code, response.message = predictor.error_code, str(predictor)
             return without_figures(response)
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)

@@ -1,9 +1,9 @@
-"""The surface control error of a command that is still to come, with an interval.
+"""The surface control error of a command before it is applied, with an interval.
 
-The regression gives the error of a command from this command and those before it. A request contains no history, but
-the error depends on it, so the answer is taken over many histories that the mirror may have in use: smooth shapes (the
-spheres and Zernike surfaces of the calibration) of any size the range allows, in random order from a rested mirror. The
-interval holds 95 % of them, widened by the uncertainty of the regression.
+The regression gives the error of a command from this command and those before it. The error depends on the history,
+which a request does not contain, so it is predicted for many histories that the mirror may have in use: smooth shapes
+(the spheres and Zernike surfaces of the calibration) of any size the range allows, in random order from a rested
+mirror. The interval contains 95 % of the predictions, widened by the uncertainty of the regression.
 """
 
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ class ErrorPredictor:
     """Predicts the error of commands with unknown history.
 
     Attributes:
-        influence: the influence function that nominal surfaces come from.
-        fit: the regression, of all surfaces p01-p58.
-        held_out_rms: error of these surfaces, see :func:`~dm_calibration.regression.surface_error.regress`, m.
+        influence: the influence function that gives nominal surfaces.
+        fit: the regression on all surfaces p01-p58.
+        held_out_rms: held-out error for these, see :func:`~dm_calibration.regression.surface_error.regress`, m.
         sag: model of the sag from commands, fitted to all good maps.
         histories: (1 + COMMANDS, HISTORIES, N) normalised signals; the first is rest, where creep has died away.
     """
@@ -76,7 +76,7 @@ class ErrorPredictor:
 
 
 def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptions | None = None) -> ErrorPredictor:
-    """A predictor from all surfaces p01-p58 of a calibration; its held-out error is the leave-one-out one.
+    """A predictor from all surfaces p01-p58 of a calibration, with its leave-one-out error.
 
     Raises as `surface_errors` and `regress` of :mod:`~dm_calibration.regression.surface_error`.
     """

@@ -1,4 +1,4 @@
-"""The sag of a command from its signals and those before it, to predict its surface control error.
+"""Model of the sag after a command, from its signals and those before it, to predict its surface control error.
 
 An influence function fitted to signals errs by hysteresis and creep. Here each actuator follows the effective signal of
 a :class:`~dm_common.hysteresis.model.HysteresisModel` of Prandtl-Ishlinskii form with creep. A few play operators
@@ -65,10 +65,10 @@ class RunHistory:
         self._crept = run.crept(self._plays)
 
     def fit(self, keep: Bools) -> SagModel:
-        """The model that explains the maps in `keep` (M,), which hold data, best."""
+        """The model that best explains the maps in `keep` (M,), which must have data."""
         area = np.sqrt(self._maps.points.weight)
         figure, sag = self._figure[keep], self._sag[keep] * area
-        free = np.linalg.qr(figure)[0]  # what the figure explains is no evidence on the weights
+        free = np.linalg.qr(figure)[0]  # sag that the figure explains is no evidence on the weights
         without_figure = without(sag, free)
         weights, rate = np.eye(len(self._radius))[0], 0.0
         for _ in range(ROUNDS):
@@ -95,7 +95,7 @@ class RunHistory:
         return np.asarray(weights @ self._plays + rate * (weights @ self._crept))
 
     def predict(self, keep: Bools) -> Floats:
-        """(M, P) m: sag of every command of the run, by the model that explains the maps in `keep` (M,) best."""
+        """(M, P) m: sag of every command of the run, by the model that best explains the maps in `keep` (M,)."""
         model = self.fit(keep)
         effective = self._effective(model.hysteresis.play_weight[:, 0], model.hysteresis.creep_rate)
         return np.asarray(self._figure @ model.figure + effective @ model.influence)

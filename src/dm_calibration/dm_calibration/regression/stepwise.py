@@ -2,12 +2,12 @@
 
 Each round enters the candidate with the smallest p value of its partial F test, if that is below `p_enter`, and then
 removes, one by one, those whose p value has risen above `p_remove`. [1] does not name its thresholds. 0.05 and 0.10 are
-the defaults of the packages that made the method common ([15], section 15.2); removal must be the milder of the two, or
-a candidate could come and go for ever.
+the defaults of the packages that made the method common ([15], section 15.2). The threshold of removal must be the
+larger one, or a candidate could enter and leave for ever.
 
-The statistics of the result are those of statsmodels for the selected model. They take the selection as if it had been
-known beforehand: the best of 58 candidates always looks better than chance, so R^2, F and p are optimistic. What counts
-is the error on samples that were not used, :func:`leave_one_out`, where the selection is made anew without each sample.
+The statistics of the result are those of statsmodels for the selected model, as if it had been chosen beforehand. The
+best of 58 candidates always looks better than chance, so R^2, F and p are optimistic. The meaningful error is that on
+unused samples, :func:`leave_one_out`, which repeats the selection without each sample.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 
-#: Share of a candidate's variation not explained by those selected, below which it brings nothing of its own.
+#: Share of a candidate's variation not explained by the selected ones, below which it cannot be selected.
 TOLERANCE = 1e-8
 #: Spread of values, relative to their size, below which they count as constant.
 CONSTANT = 1e-12
 P_ENTER = 0.05
 P_REMOVE = 0.10
-#: Degrees of freedom that must be left for the residual: with more candidates than samples, a selection that runs on
-#: until none is left fits anything.
+#: Least number of degrees of freedom left for the residual: with more candidates than samples, a selection could go on
+#: until it fits anything.
 FREEDOM_MIN = 10
 
 
@@ -115,9 +115,9 @@ def stepwise(
         weights: (n,) above 0, proportional to the inverse variance of each sample (WLS); None = OLS.
 
     Raises:
-        TooFewMapsError: a constant candidate, two that are proportional up to a constant, or, with more samples than
-            candidates, any that the others determine. (With fewer samples every set of candidates is dependent; the
-            selection then leaves out what the selected ones determine.) Or no freedom left for one variable.
+        TooFewMapsError: too few samples for one variable; a constant candidate; two that are proportional up to a
+            constant; or, with more samples than candidates, any that the others determine. (With fewer samples,
+            candidates are always dependent, and the selection leaves out those that the selected ones determine.)
         ValueError: a constant response.
         Refusal: NOT_SUPPORTED, statsmodels is not installed.
     """
@@ -160,16 +160,16 @@ def leave_one_out(
 
 
 def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[int]:
-    """Columns in the order they entered. A QR of the few selected and a projection of all candidates per round."""
+    """Columns in the order they entered. Each round takes a QR of the few selected and projects all candidates."""
     root = np.sqrt(w)
     constant = root[:, np.newaxis]
     columns, target = root[:, np.newaxis] * x, root * y
-    # Only the variation about the constant counts, or an offset would hide what a candidate brings.
+    # Only the variation about the constant counts: an offset would hide the contribution of a candidate.
     unit = constant / np.linalg.norm(constant)
     whole = np.square(columns).sum(axis=0)
     columns, target = columns - unit @ (unit.T @ columns), target - unit[:, 0] * (unit[:, 0] @ target)
     energy = np.square(columns).sum(axis=0)
-    # A candidate that varies in one sample only is constant where that one is left out: what remains is rounding.
+    # A candidate that varies in one sample only is constant, up to rounding, when that sample is left out.
     varies = energy > CONSTANT**2 * whole
     floor = CONSTANT**2 * (target @ target)
     selected: list[int] = []
@@ -196,7 +196,7 @@ def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[
 
 
 def _remove(columns: Floats, target: Floats, selected: list[int], options: SelectionOptions) -> None:
-    """Take out of `selected`, one at a time, what is no longer significant beside the others."""
+    """Remove from `selected`, one at a time, variables that are not significant beside the others."""
     while len(selected) > 1:
         q, r = np.linalg.qr(columns[:, selected])
         freedom = len(target) - len(selected) - 1

@@ -1,27 +1,27 @@
 """Predict the surface control error of a surface: section 3.1 of [1].
 
-The surface control error of a map is the map less its nominal surface G s, piston and tilt removed, and the response
-its rms over the whole aperture. The sample surfaces p01-p58 train the regression.
+The surface control error of a map is the map less its nominal surface G s, piston and tilt removed; the response is its
+rms over the whole aperture. The sample surfaces p01-p58 train the regression.
 
-*Candidates.* [1] has 37 signals and 21 coefficients. The error is a norm, sqrt(|figure + print-through s + what the
-actuators remember|^2): almost no linear function of either, which is why the adjusted R^2 in [1] is 0.2
+*Candidates.* [1] has 37 signals and 21 coefficients. The error is a norm, sqrt(|figure + print-through s + memory of
+the actuators|^2), and hardly a linear function of either: hence the adjusted R^2 of 0.2 in [1]
 (`studies.paper.readings` compares the readings of [1]). The candidates here are the signals and one more, `model`:
 the norm of the error predicted from the commands so far (:mod:`~dm_calibration.regression.sag_history`). It contains
 hysteresis and creep, and a figure that drifts with the reference frames. No measurement of the surface itself enters,
 but the frames before and after it do.
 
 `model` is never taken from a fit that has seen the surface: every surface is predicted from a fit without its own fold.
-(G is: it defines the nominal surface, so it is part of the question, not of the answer.)
+(G has seen it, but G only defines the nominal surface, and with that the error to be predicted.)
 
 *Thresholds.* Of C candidates without any effect, the best passes 0.05 more often than not. The usual thresholds are
-divided by C (Bonferroni): with `model` in, a signal that enters by chance makes a poke of its actuator unpredictable.
+divided by C (Bonferroni): beside `model`, a signal that enters by chance makes a poke of its actuator unpredictable.
 
-*AZWreg.* (a) Another G, from coefficients fitted with region weights; (b) the response a region-weighted norm; (c)
-weighted least squares, each surface weighted by Eq. (8) with r the variance of its own ten regional errors; (d) all ten
-regions of all surfaces as samples of one regression. Table 3 gives Err and RelErr, hence the true errors, and they are
-the same for both models to within rounding: that excludes (b). n = 49 in Table 2 excludes (d). Chosen is (a) with (c):
-the influence function carries its method, :func:`surface_weights` gives the weights, and Eq. (8) does what the text
-says, "make a larger value of variability have less impact". epsilon is the median of the r.
+*AZWreg* could mean: (a) another G, from coefficients fitted with region weights; (b) a region-weighted norm as
+response; (c) weighted least squares, each surface weighted by Eq. (8) with r the variance of its own ten regional
+errors; (d) all ten regions of all surfaces as samples of one regression. Table 3 gives Err and RelErr, hence the true
+errors, which are the same for both models to within rounding: that excludes (b). n = 49 in Table 2 excludes (d). Here
+it is (a) with (c): the influence function states its method, :func:`surface_weights` gives the weights, and Eq. (8)
+does as the text says, "make a larger value of variability have less impact". epsilon is the median of the r.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,12 +42,12 @@ from dm_common.optics.sample_regions import regional_rms
 
 #: p01 to p58; the Zernike surfaces are not part of the regression.
 SURFACES = tuple(name for name in TABLE_1 if not name.startswith("pz"))
-#: Folds in which the surfaces are left out of the fits that `model` comes from.
+#: Number of folds in which surfaces are left out of the fits that give `model`.
 FOLDS = 10
 #: Name of the candidate made from the influence function.
 MODEL = "model"
 
-#: Sag of all commands of a run, (M, P) m, from the maps that it may see, (M,).
+#: Returns the sag after all commands of a run, (M, P) m, by a fit to the given maps (M,).
 Prediction = Callable[[Bools], Floats]
 
 
@@ -56,7 +56,7 @@ class SurfaceErrors:
     """The sample surfaces of a calibration with their errors.
 
     Attributes:
-        rows: (S,) their places among the maps.
+        rows: (S,) their indices among the maps.
         labels: (S,) of p01-p58.
         signals: (S, N) as applied.
         regional: (S, R) m, rms surface control error inside concentric regions, the whole aperture last.
@@ -92,8 +92,8 @@ def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
 def surface_weights(errors: SurfaceErrors) -> Floats:
     """(S,) weights of the surfaces for AZWreg: Eq. (8) with r the variance of a surface's regional errors, m^2.
 
-    Scaled such that a surface of weight 1 has the average variance: a new surface, whose regional errors have not been
-    measured, counts with that weight.
+    Scaled so that a surface of average variance has weight 1, the weight of a new surface, whose regional errors have
+    not been measured.
 
     Raises:
         ValueError: the errors of all surfaces are the same in all regions, so that Eq. (8) gives no weights.
@@ -145,7 +145,7 @@ def model_candidates(
 
 
 def held_out_errors(maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction) -> Floats:
-    """(S, P) error surfaces of the sample surfaces, each predicted without having seen it, m."""
+    """(S, P) errors of the sample surfaces, m, each predicted by a fit that has not seen it."""
     fold = np.arange(len(errors.rows)) % FOLDS
     sag = np.empty((len(errors.rows), len(maps.points)))
     for k in np.unique(fold):

@@ -27,11 +27,11 @@ from dm_common.optics.zernike import PISTON_TILT
 
 #: File with the names of operator and instrument, set once by `./dm report --operator NAME --instrument NAME`.
 PEOPLE = Path("~/.ros/dm_report.json")
-#: Largest predicted coefficient error of a curvature in the range, m; resolution of the limits of the range, 1/m.
+#: Largest predicted coefficient error for a curvature in the range, m; resolution of the ends of the range, 1/m.
 TOLERANCE, STEP = 20e-9, 1e-4
 #: Number of spheres over the range from which the median predicted error is found.
 SPHERES = 11
-#: Relative weight of the signals in the fit of a shape: makes it definite with more actuators than terms.
+#: Relative weight of the signals in the fit of a shape: makes it unique if there are more actuators than terms.
 RIDGE = 1e-9
 
 
@@ -45,7 +45,7 @@ def people(file: Path = PEOPLE) -> dict[str, str]:
 
 
 def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
-    """Keep the given names for this report and later ones; "" = no name, which is not asked for again.
+    """Keep the given names for this report and later ones; "" = no name, for which no question is asked again.
 
     Raises:
         OSError: the file cannot be written.

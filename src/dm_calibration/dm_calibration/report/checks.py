@@ -22,7 +22,7 @@ SHOWN = 20
 def valid_until(
     checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = JUDGED_BY
 ) -> tuple[float, str]:
-    """Time until which a calibration is valid, s since the epoch, and the reason; a new one is due by then.
+    """Time until which a calibration is valid, s since the epoch, and the reason; the next calibration is due then.
 
     The trend is the median of all slopes between two checks; it counts if its 90 % interval is above zero.
 

@@ -34,7 +34,7 @@ def _counted(number: int, one: str, many: str) -> str:
 
 
 def summary(calibration: Calibration) -> Section:
-    """What a user needs to know first."""
+    """Key figures."""
     fit, hysteresis, wavelength = calibration.fit, calibration.hysteresis, calibration.wavelength
     grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
     recipes = [recipe.max_zernike for recipe in calibration.recipes.recipes]

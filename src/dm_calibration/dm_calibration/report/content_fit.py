@@ -23,7 +23,7 @@ def residuals(calibration: Calibration) -> MapSet:
     """The maps used in the fit, with the residuals of their sag (0 where a map has no data) and coefficients, m.
 
     A residual is the measured value less influence function times signals less the drifting figure, without piston and
-    tilt; `applied` holds effective signals if there is a hysteresis model. The figure is found again from the
+    tilt; `applied` contains effective signals if there is a hysteresis model. The figure is recomputed from the
     residuals: for a given influence function, its values at the reference frames solve the same least-squares problem.
 
     Raises:

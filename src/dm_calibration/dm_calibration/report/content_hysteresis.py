@@ -11,7 +11,7 @@ from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook, recipe_row
 
-#: Minor loops, in shares of half the range: turning points on the falling branch, and the rise from each and back.
+#: Minor loops, in shares of half the range: turning points on the falling branch, and the rise from each of them.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
 MINOR_DEPTH = 0.5
 #: Times after a step, s.

@@ -46,7 +46,7 @@ COLUMN_MAX = 0.38
 TABLE_SIZE = 8.0
 FOOT = HexColor("#444444")
 RULE = HexColor("#dddddd")
-#: The fonts of the figures: they have the Greek letters and signs of the text, which the standard PDF fonts lack.
+#: The fonts of the figures: they have the Greek letters and symbols of the text, which the standard PDF fonts lack.
 REGULAR, BOLD = "DejaVuSans", "DejaVuSans-Bold"
 
 TITLE = ParagraphStyle("title", fontName=BOLD, fontSize=15, leading=19, spaceAfter=10)

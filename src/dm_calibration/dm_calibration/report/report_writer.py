@@ -25,7 +25,7 @@ NICENESS = 15
 
 
 class ReportWriter:
-    """Writes one report after the other; if a waiting calibration changes again, only its last state is reported.
+    """Writes one report after another; if a calibration changes while it waits, only its last state is reported.
 
     Args:
         publish: called with a sentence and whether it is a warning, from the thread of the writer.

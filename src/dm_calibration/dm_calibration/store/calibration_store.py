@@ -173,6 +173,6 @@ class CalibrationStore:
 
 
 def raw_hash(calibration: Calibration) -> str:
-    """Hash over the raw data: equal only if every bit is."""
+    """Hash over the raw data, to compare them bit by bit."""
     columns = to_columns(calibration)[0]
     return content_hash({name: values for name, values in columns.items() if name.startswith(_RAW)}, {})

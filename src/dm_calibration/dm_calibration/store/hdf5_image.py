@@ -28,7 +28,7 @@ HASH = "content_sha256"
 SIZE_MAX = 1 << 28
 #: Size of the smallest superblock at the start of such a file [bytes].
 SUPERBLOCK = 96
-#: Most groups and datasets that are accepted; more hint at a loop in a damaged file.
+#: Largest accepted number of groups and datasets; more indicate a loop in a damaged file.
 _OBJECTS_MAX = 1000
 
 _TEXT = h5py.string_dtype("utf-8")

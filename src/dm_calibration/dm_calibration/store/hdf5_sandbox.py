@@ -1,9 +1,9 @@
 """Reading HDF5 in a separate process: damaged files can crash the HDF5 library or make it loop forever.
 
-The library trusts the files it reads. Bits flipped in a file's structure make it follow wild pointers, loop or allocate
+The library trusts the files it reads. Flipped bits in a file's structure make it follow wild pointers, loop or allocate
 without bounds (seen with HDF5 2.0 in the fuzzing of :mod:`fault_injection`). So a helper process reads the bytes, with
 limits on memory and computing time, and returns plain arrays and texts. If it dies, the file counts as damaged, and the
-next file gets a new helper. The helper ends with the process that started it.
+next file gets a new helper. The helper ends together with the process that started it.
 """
 
 import atexit
