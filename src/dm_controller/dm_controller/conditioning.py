@@ -1,7 +1,7 @@
 """A degauss on the way to a shape: which order waits for it, how long it takes, and when it has failed.
 
-A degauss that has begun is completed: a newer order replaces the one that waits; after a cancel the mirror is left at
-mid range with its history known. Steady times, s, are passed to each call.
+A degauss, once begun, is completed. A newer order replaces the one that waits; after a cancel the degauss leaves the
+mirror at mid range with a known history. Times are those of the steady clock, s.
 """
 
 import math
@@ -15,7 +15,7 @@ from dm_controller.planning.choice import Degauss
 
 #: Half-swings assumed where the driver uses its own configured number, which is not known here.
 STEPS_ASSUMED = 100
-#: Longest wait for the driver to report a degauss that it has answered as done, s.
+#: Longest time between the driver's answer that a degauss is done and the report that counts it, s.
 REPORT_S = 2.0
 
 
@@ -24,10 +24,10 @@ class Run:
     """A degauss under way.
 
     Attributes:
-        number: of the run.
+        number: identifies the run.
         steps: half-swings; 0 = as configured in the driver.
-        began: s.
-        degausses, starts: counts of the driver before it.
+        began: when, s.
+        degausses, starts: degausses and restarts of the driver that had been counted before it.
         answered: s, when the driver said that it is done; None = not yet.
     """
 
@@ -52,12 +52,12 @@ class Conditioning:
         self.order: Order | None = None
         self._number = 0
         self._learnt: dict[int, float] = {}
-        self._learnt_at = (math.nan, math.nan)  # slew rate and half the range
+        self._learnt_at = (math.nan, math.nan)  # slew rate and half range under which they were learnt
 
     def duration(self, steps: int, active: ActiveCalibration) -> float:
         """Time in s that a degauss of `steps` half-swings (0 = as configured in the driver) takes; 0 = not known.
 
-        That of the last one; before the first, from the path (half the span per half-swing) and the slew rate.
+        As measured on the last one; before the first, from the path (half the span per half-swing) and the slew rate.
         """
         slew_rate, half_span = active.planner.slew_rate, active.mirror.limits.half_range
         if (slew_rate, half_span) != self._learnt_at:  # another mirror, or another configuration
@@ -72,7 +72,7 @@ class Conditioning:
         return half_span * ((steps or STEPS_ASSUMED) + 2) / slew_rate
 
     def prospect(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
-        """The next degauss to end: the one under way, or a new one of as many half-swings as `configured`."""
+        """The degauss that a move would wait for: the one under way, or a new one of `configured` half-swings."""
         run = self.run
         if run is None:
             steps = active.degauss_steps(configured)

@@ -1,12 +1,12 @@
-"""Holding a shape: creep is fed forward in small corrections, as often as the shape would leave its tolerance.
+"""Holding a shape: predicted creep is corrected in small steps, whenever the shape would leave its tolerance.
 
-Creep slows down with the age of a shape, so corrections come at ever longer intervals: after an hour in minutes.
-What is kept are the effective signals of the move. Each correction is the inverse of the hysteresis model from the
-state that the driver reports, so that the next correction makes good what was rounded or cut short.
+Creep slows down with the age of a shape, so corrections become rarer: after an hour they are minutes apart.
+The hold keeps the effective signals of the move. Each correction inverts the hysteresis model from the state that
+follows from the driver's reports, so it also makes up for the rounding and slew limit of earlier corrections.
 
 A shape that was set from an unknown history is held too: creep is known from the moves that were seen, and its error is
-a small part of a small correction. When the history gets lost during a hold, the hold ends: the guess that replaces the
-state does not give the shape that the mirror holds.
+a small part of a small correction. If the history is lost during a hold, the hold ends: the state is then only a guess,
+which does not describe the shape that the mirror holds.
 """
 
 import math
@@ -26,12 +26,12 @@ from dm_controller.focus_types import Moment, SendCommand
 PERIOD_S = 0.02
 #: A shape that needs no correction is checked again after this share of the time since the last command.
 CHECK_SHARE = 0.1
-#: Time for the driver to report a command as its own, s, steady; later, another publisher must have overtaken it.
+#: Time within which the driver reports a command as its own, s, steady; after that, other signals are another client's.
 CONFIRM_S = 1.0
 
 
 class CreepHold:
-    """Keeps the shape that was commanded last, of the order that `monitor` follows, by the live parameters `hold.*`.
+    """Holds the shape commanded last, that of `monitor.order`, against creep; the parameters `hold.*` are read live.
 
     Attributes:
         corrections: number sent so far.
@@ -72,7 +72,7 @@ class CreepHold:
                 order.creep_held, self.ended = False, reason
 
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
-        """Take the driver's last request (N,), reported at `now` (s, steady): if it is another's, the hold ends."""
+        """End the hold if the signals (N,) that the driver follows, reported at `now` (s, steady), are another's."""
         order = self._monitor.order
         command = order.command if order is not None else None
         if command is None or same_signals(requested, command.signals):

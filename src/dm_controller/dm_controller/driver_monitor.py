@@ -1,7 +1,7 @@
 """The driver's last report, whether reports still come, whether it took the last command, and its latency.
 
-A driver that is stopped or was killed sends nothing: its last report would say for ever that it is active. So reports
-age here, by the steady clock, and a command that no report confirms is reported.
+A driver that was stopped or killed sends nothing: its last report would say for ever that it is active. So reports
+expire here, by the steady clock, and a command that no report confirms in time counts as not taken.
 """
 
 import math
@@ -24,9 +24,9 @@ _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, Actu
 CONFIRM_S = 3.0
 #: A clock that gains this much on the steady one between two reports, s, was set, or the computer slept.
 CLOCK_JUMP_S = 5.0
-#: Number of moves over which the latency is taken.
+#: Number of moves whose median latency is taken.
 MOVES = 20
-#: A first write later than this, s, is by another clock, or was reported too late.
+#: Longer latencies, s, are ignored: the driver's stamps come from another clock, or its report came late.
 LATENCY_MAX_S = 1.0
 #: Progress of an order whose shape somebody else has replaced.
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
@@ -42,13 +42,13 @@ def _not_active(report: ActuatorState) -> Refusal:
 
 
 class DriverMonitor:
-    """Judges the driver by its reports, `driver_timeout` and `move_timeout`. Steady times, s, are passed to each call.
+    """Judges the driver by its reports, `driver_timeout` and `move_timeout`. Methods take steady times, s.
 
     Attributes:
         order: the order whose shape was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
         starts: number of times the driver was activated anew, as far as reports show.
-        open_until: s, until when the driver is taken to accept commands of anybody; after that, ask `check`.
+        open_until: s, until when anybody may send commands without a `check`.
         gone: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
@@ -60,7 +60,7 @@ class DriverMonitor:
         self.open_until = -math.inf
         self.gone = ""
         self._heard = 0.0
-        # s: this clock minus the steady one, and how far stamps are ahead of each; infinite until known: no gain.
+        # s: ROS minus steady time, and how far stamps are ahead of each; infinite until known, which shows no gain.
         self._drift, self._ahead = math.inf, (math.inf, math.inf)
         self._stamp: int | None = None
         self._latencies: deque[float] = deque(maxlen=MOVES)
@@ -72,7 +72,7 @@ class DriverMonitor:
 
     @property
     def stood(self) -> Order | None:
-        """The order whose shape is still held while the last order's first command is not taken; None = none."""
+        """The previous order, while the driver holds its shape and has not taken the last order's first command."""
         stood, report = self.order.stood if self.order is not None else None, self.latest
         if stood is None or stood.command is None or report is None:
             return None
@@ -80,7 +80,7 @@ class DriverMonitor:
 
     @property
     def shape(self) -> Order | None:
-        """The order whose shape the driver reports, possibly before a correction that is on its way; None = none."""
+        """The last order, if the driver reports its shape, with or without the latest creep correction; else None."""
         order, report = self.order, self.latest
         if order is None or order.move is None or not order.kept or report is None:
             return None
@@ -153,7 +153,7 @@ class DriverMonitor:
         return None
 
     def check(self, request: FocusRequest, now: float) -> None:
-        """Raise what `refusal` gives, or what `held` does."""
+        """Raise the Refusal that `refusal` or `held` returns, if any."""
         if refusal := self.refusal(now) or self.held(request):
             raise refusal
 
@@ -165,7 +165,7 @@ class DriverMonitor:
         return Refusal(ErrorCode.BUSY, report.holding)
 
     def settled(self, replaced: str = "") -> list[PublishState]:
-        """The outcome of the last order's command, once: the driver has confirmed it, or it is `replaced` before."""
+        """Publish the outcome of the last order's command, once: confirmed, or not because it was `replaced`."""
         order = self.order
         if order is None or order.command is None or order.answered or not (order.command.confirmed or replaced):
             return []
@@ -175,7 +175,7 @@ class DriverMonitor:
         return [PublishState(order)]
 
     def stopped(self, now: float) -> str:
-        """The reason why what was begun with the driver cannot end any more; "" = it can: a lost link comes back."""
+        """The reason why the driver cannot finish what it has begun; "" = it can: a lost link comes back."""
         report = self.latest
         if report is not None and report.driver_state in _STOPPED and not self.gone:
             return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
@@ -249,6 +249,6 @@ class DriverMonitor:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
         if stamp_ns(report.header.stamp) < command.sent.ns:
             return Refusal(ErrorCode.TIMEOUT, f"{text}: it keeps the shape from before, nothing has reached it since")
-        if command.expected_turns:  # a correction that another's command came before, as it may
+        if command.expected_turns:  # a creep correction, which another client's command may overtake
             return None
         return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")

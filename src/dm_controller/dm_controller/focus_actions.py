@@ -1,4 +1,4 @@
-"""Interfaces to ask for a shape: services `set_focus` and `flatten`, action `move_focus`; the driver's degauss."""
+"""Interfaces for requests: services `set_focus` and `flatten`, action `move_focus`; client of the driver's degauss."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dm_controller.focus_types import Effect, Moment, Order, Progress, StartDega
 
 #: Polling period of an order, s, by an action and by a service; period of feedback, s.
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
-#: Margin for a confirmation beyond the time after which the controller itself gives a command up, s.
+#: Further wait for a confirmation after the controller should have given the command up itself, s.
 GRACE_S = 1.0
 #: Time after the start, s, within which a request waits for calibration, driver and clock.
 START_S = 3.0
@@ -255,7 +255,7 @@ class DegaussClient:
         return bool(self._client.server_is_ready())
 
     def start(self, run: StartDegauss) -> None:
-        """Call the driver. If it has just gone, nothing comes of it, and `Conditioning.failure` says so."""
+        """Call the driver. If it has just died, no answer comes, and `Conditioning.failure` ends the run."""
         goal = Degauss.Goal(steps=run.steps, holder=run.holder, take_over=run.take_over)
         # Through the executor: if the answer is there already, this thread would take the node's lock twice.
         self._client.send_goal_async(goal).add_done_callback(

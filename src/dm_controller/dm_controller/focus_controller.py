@@ -69,7 +69,7 @@ class FocusController:
     # --- what is known ---
 
     def use(self, calibration: Any, mirror: Any, recipes: Any = None) -> list[Effect]:
-        """Use these dm_msgs as `active_calibration` does; where it refuses to, requests are refused from now on."""
+        """Use calibration, mirror and recipes (dm_msgs); if `active_calibration` refuses them, refuse all requests."""
         before, effects = self.active, list[Effect]()
         hold_tilt, axis = self._values["hold_tilt"], self._values["optical_axis"]
         try:
@@ -125,7 +125,7 @@ class FocusController:
         return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
 
     def _news(self, now: Moment, more: bool = False) -> list[Effect]:
-        """Publish what changed: of the driver (or if `more`), and of the actuators, seldom while the mirror moves."""
+        """Publish capabilities if the driver's state changed or if `more`; a changed estimate, rarely during moves."""
         refusal, observer, effects = self.unavailable(now), self.observer, list[Effect]()
         known = refusal.error_code if refusal else ErrorCode.OK, observer.unknown
         if more or self._reported != known:
@@ -215,7 +215,7 @@ class FocusController:
         return [Log("warning", f"refused: {refusal}"), PublishState(order)]
 
     def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
-        """Send the command of `move`, the shape to keep from now on; until the driver has it, the one before holds."""
+        """Send the command of `move` and hold its shape; until the driver takes it, the shape before is held."""
         order.command = SendCommand(move.signals, now, 0, order.request.holder, order.request.take_over)
         order.checked, order.starts = now.time, self.monitor.starts
         effects: list[Effect] = [order.command]

@@ -148,7 +148,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment, 
 def capabilities_message(
     controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now: Moment
 ) -> Capabilities:
-    """What the mirror can do `now`, by which it is judged whether the driver still reports."""
+    """What the mirror can do; a driver whose last report is too old at `now` counts as silent."""
     active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
     message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)
     message.header.stamp = time_message(now.ns)

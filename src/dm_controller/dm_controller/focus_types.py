@@ -31,7 +31,7 @@ class Moment(NamedTuple):
 
 @dataclass(eq=False)
 class SendCommand:
-    """Publish this actuator command; the controller records in it what the driver reports of it.
+    """Publish this actuator command; the controller records in it whether the driver took it.
 
     Attributes:
         signals: (N,)
@@ -56,9 +56,9 @@ class SendCommand:
 
 @dataclass(eq=False)
 class Order:
-    """A request on its way through the controller, which alone changes it; the last one is the present shape.
+    """A request on its way through the controller, which alone changes this record; the last one is the present shape.
 
-    `DriverMonitor` follows how that shape is reached, `CreepHold` keeps it.
+    `DriverMonitor` follows how the shape is reached, `CreepHold` keeps it.
 
     Attributes:
         request: what was asked for.
@@ -70,12 +70,12 @@ class Order:
         pending: it waits for a degauss.
         applied: the driver has confirmed the command.
         answered: the outcome of its command has been published.
-        gap: largest distance from its shape seen, normalised.
+        gap: largest distance of the applied signals from its shape that was reported, normalised.
         command: the last command for its shape; None = none was sent.
-        earlier: the last confirmed command before that, which holds until the last one, on its way, arrives.
-        creep_held: its shape is corrected for creep, from its command on, until that is ended.
+        earlier: the last confirmed command before `command`, which the driver follows until `command` arrives.
+        creep_held: its shape is corrected for creep, from its command until the hold ends.
         checked: s, ROS time, of the last check for creep.
-        stood: the order whose shape stays if the driver does not take the first command, until it has; None = none.
+        stood: the order before, whose shape is held until the driver takes the first command of this one; None = none.
         kept: its move was not stopped.
         starts: number of times that the driver had been activated anew when its first command was sent.
     """

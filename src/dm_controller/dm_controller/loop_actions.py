@@ -64,7 +64,7 @@ class LoopBench(BenchServices):
     ) -> tuple[str, int, str]:
         """Outcome, ErrorCode and sentence of a goal of the action `name`, which has the bench for itself.
 
-        Its cancellation ends waits, and its feedback reports what is waited for.
+        Cancelling the goal ends waits, and its feedback names them.
 
         Args:
             asked: the goal or request, which names the client, see `BenchServices.held`.
@@ -127,7 +127,7 @@ class LoopBench(BenchServices):
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def degauss(self, steps: int = 0) -> None:
-        """Make the condition that recipes begin with; the driver's own number of steps may differ."""
+        """Degauss with the number of half-swings that recipes begin with, which may differ from the driver's."""
         super().degauss(steps or int(self.parameters["recipes.degauss_steps"]))
         self._history_known = self._by_history  # from here on, so that a loss before the first map counts too
 

@@ -25,10 +25,10 @@ class ActuatorWriter(WriterThread):
     def enable(self, timeout_s: float) -> bool:
         """Allow writes; the mirror goes to the safe shape first. Returns whether it got there within `timeout_s`.
 
-        No unit can be read back. The ramp begins at the shape written last, by this object or, according to `last`, by
-        another: that shape is written again, then the ramp follows. If nothing is known, there is nothing to ramp from,
-        and the safe shape is written in one step. Without a link this happens as soon as the link is up, and a link
-        lost on the way only delays it; an accepted command replaces it.
+        No unit can be read back. The ramp begins at the shape written last, by this object or, according to the record
+        `last`, by another driver: that shape is written again, then the ramp follows. If no last shape is known, the
+        safe shape is written in one step. Without a link all this happens as soon as the link is up, and a link lost
+        during the ramp only delays it; an accepted command replaces it.
         """
         move: Move | None = None
         with self._change:
@@ -54,7 +54,7 @@ class ActuatorWriter(WriterThread):
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on.
 
-        A unit may take its frames more slowly than the limits allow; it is given up when it takes none for `timeout_s`.
+        A slow unit may need longer than the limits do: the ramp is given up only when no frame is taken in `timeout_s`.
         """
         with self._change:
             self._accepting = False
@@ -112,7 +112,7 @@ class ActuatorWriter(WriterThread):
             return self.command(shape)
 
     def turn_back(self, move: Move, halt: bool = False) -> Move | None:
-        """Abandon `move` for the shape requested before it; with `halt`, for the present place, within a step.
+        """Abandon `move` and return to the shape requested before it; with `halt`, stop at the present shape.
 
         Returns the move back; None = another command came since.
         """

@@ -18,8 +18,8 @@ FULL_CYCLE = 0.999
 def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: int, end: Shape) -> Iterator[Shape]:
     """Yield the turning points: `middle` -r, +r, -r, ... with r falling linearly from `amplitude` to 0, then `end`.
 
-    All actuators move together, so neighbours never differ between turning points. The points are for a ramp: the
-    vendor's version steps from one to the next with no slew limit.
+    All actuators move together, so neighbours never differ between turning points. Ramps have to join the points: only
+    the vendor's version steps from one to the next with no slew limit.
 
     Args:
         amplitude: first half-swing about the middle, inside the limits.

@@ -8,8 +8,8 @@ from dm_common.ros.lifecycle import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.moves import WriterState
 
-#: A unit that has not answered this long after the configuration is missing, s; until then it is awaited, since the
-#: driver may have been started first.
+#: Time after the configuration, s, for which a silent unit is awaited, since the driver may have been started first;
+#: later it counts as missing.
 AWAIT_S = 15.0
 
 
@@ -68,7 +68,7 @@ def driver_health(
         return Health(WARN, "inactive: commands are refused", values)
     if writer.unrecorded:
         return Health(WARN, f"{writer.unrecorded}; after a kill the first frame would be one step", values)
-    # What an unreachable unit refused is over: the link is up.
+    # A refusal for want of a link is out of date, as the link is up.
     if refusal is not None and refusal.error_code != ErrorCode.ELECTRONICS_UNREACHABLE:
         return Health(WARN, f"the last command was refused: {refusal}", values)
     if not state.history_known:

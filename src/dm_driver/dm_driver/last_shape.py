@@ -2,8 +2,8 @@
 
 No unit can be read back, and its outputs hold when the driver dies. A new driver that knows nothing must write its
 first shape in one step; one that finds this record continues from where the old one ended. A shape is recorded *before*
-it is sent: the outputs are then at the record or at most one step away from it. The record holds codes that are not
-rounded: they stand for the same outputs when the volts of the signals are configured anew.
+it is sent: the outputs are then at the record or at most one step away from it. The record holds DAC codes, not
+rounded, since they mean the same outputs after the parameters `volts.*` have changed.
 
 Two slots are written in turn, each with a checksum, so that one is complete at any moment. The operating system keeps
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
@@ -86,7 +86,7 @@ class LastShape:
         try:
             if (codes := self.load()) is not None:
                 return limiter.check_shape(scale.signals_of_codes(codes), "what was sent last")
-        except (OSError, Refusal) as error:  # the limits have changed: no legal way begins there
+        except (OSError, Refusal) as error:  # a Refusal: the limits have changed, and no legal ramp begins there
             logging.getLogger(__name__).warning("what was recorded last is not gone by: %s", error)
         return own
 

@@ -177,7 +177,7 @@ class WriterThread:
         self._last.claim()
         self._electronics.open()
         if self._rewrite_due:
-            self._confirm()  # first, since what is sent is recorded, and a busy unit is where its own driver puts it
+            self._confirm()  # before anything is recorded as sent: a busy unit takes nothing from here
             with self._change:
                 if due := self._rewrite_due and not self._stopping:  # it may have been disabled meanwhile
                     own, self._shape = self._shape, self._last.known(self._shape, self._output.scale, self._limiter)
@@ -279,8 +279,8 @@ class WriterThread:
             self._fault = reason
             self._queue.history_known = False
             self._rewrite_due = self._enabled
-            # A lost link ends all moves but the one to the safe shape, which was promised; that of `disable` is waited
-            # for, so it must end.
+            # A lost link ends all moves except one to the safe shape, which continues later; the move of `disable` ends
+            # too, since its caller waits.
             newest = self._queue.newest
             to_safe = self._accepting and newest is not None and newest.kind is Kind.SAFE
             self._queue.end_all(Outcome.LINK_LOST, self._shape, newest if to_safe else None)

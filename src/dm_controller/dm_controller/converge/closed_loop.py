@@ -4,12 +4,12 @@ Knows no ROS. The first map judges the open-loop command; each further map judge
 correction miss by some share of itself, so the loop contracts instead of ending in one step; the share is not known
 beforehand. Two things keep it from diverging:
 
-- the response is watched: after each step the change that was seen is compared with the change that was asked for, and
-  the next correction is scaled by the inverse of their ratio (a secant step in one number, within bounds);
-- when the error grew nevertheless, the next correction is halved, once more each time.
+- after each step the measured change is compared with the commanded one, and the next correction is scaled by the
+  inverse of their ratio (a secant step in one number, within bounds);
+- if the error grows nevertheless, corrections are halved from then on, again each time it happens.
 
 Creep goes on while the loop measures: after a large move the surface drifts more between two early maps than a
-correction misses. Given the law of the actuators, the loop aims at the time of the next map.
+correction misses. With the actuators' hysteresis model, corrections include the creep until the next map.
 
 The best command seen is kept. Damped corrections lie between two legal commands, so they are legal as well.
 """
@@ -34,7 +34,7 @@ from dm_controller.solvers.base import Shape, Solver, measured_shape, rms_sag
 
 #: Bounds of the factor by which the observed response may scale a correction.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5
-#: Changes below this (m) show noise rather than the response, and growth by less is no divergence.
+#: Noise of a measured change, m: smaller changes do not show the response, and smaller growth is no divergence.
 CHANGE_MIN = 3e-9
 #: Lower bound of the damping: weaker corrections would not converge, and further growth has another cause.
 DAMPING_MIN = 0.1
@@ -50,8 +50,8 @@ class LoopOptions:
     Attributes:
         tolerance: largest coefficient error beyond tilt, m, at which the loop has converged.
         max_maps: maps it may take, the one of the open-loop command included.
-        correct_last: when the maps are used up, make the correction that the last one asks for as well, and leave it
-            unmeasured; else the mirror is left with a command that was measured.
+        correct_last: after the last map, make one more correction, which stays unmeasured; else the mirror is left with
+            a command that was measured.
     """
 
     tolerance: float = 2e-9
@@ -60,12 +60,12 @@ class LoopOptions:
 
 
 class Creep:
-    """Predicts creep from the map just taken to the next one, which is assumed to take as long as this one did.
+    """Predicts the creep between the map just taken and the next, which is assumed to take as long as this one.
 
     Args:
         law: of the actuators; without creep, zero is predicted.
-        state: before the loop's first command, which comes next.
-        now: the plant's time, s, on the clock of `state`; it must advance steadily.
+        state: of the actuators before the loop's first command.
+        now: returns the time, s, on the clock of `state`, which must advance steadily.
     """
 
     def __init__(self, law: HysteresisModel, state: HysteresisState, now: Callable[[], float]) -> None:
@@ -143,7 +143,7 @@ class StoppedLoop(Cancelled):
 
 
 def response_ratio(asked: Shape, seen: Shape) -> float:
-    """Observed share of the change asked for, by least squares over coefficients beyond tilt; NaN if too little moved.
+    """Ratio of measured to commanded change, by least squares over coefficients beyond tilt; NaN if too little moved.
 
     Coefficients are weighted by their rms sag.
     """

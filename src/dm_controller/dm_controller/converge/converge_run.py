@@ -52,7 +52,7 @@ def _loop(bench: LoopBench, goal: Any, report: Callable[[LoopStep], None]) -> tu
     options = LoopOptions(  # 0 = as configured
         goal.tolerance or values["converge.tolerance"], goal.max_maps or values["converge.max_maps"]
     )
-    bench.move(goal.request)  # refused before anything is waited for
+    bench.move(goal.request)  # an impossible request is refused before any wait
     solver = solver_of(bench.active_calibration(), goal.method)
     bench.check_ready()
     goal.request.mode = FocusRequest.MODE_DIRECT  # from the present state, by the law of the actuators

@@ -17,8 +17,8 @@ from dm_controller.solvers.base import Shape
 
 #: Lower bound of the standard deviation of a mean of maps, m.
 SIGMA_MIN = 1e-12
-#: Maps of a round that are farther from their median than FAR median distances, and than FAR_MIN (m), do not count,
-#: from FEW maps on: a door slammed, or the map shows an earlier surface.
+#: A map farther from the median of its round than FAR times the median distance and than FAR_MIN (m) is an outlier: a
+#: door slammed, or it shows an earlier surface. Rounds of fewer than FEW maps keep all.
 FAR, FAR_MIN, FEW = 4.0, 2e-9, 4
 
 

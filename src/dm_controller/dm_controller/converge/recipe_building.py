@@ -3,9 +3,9 @@
 Knows no ROS. Every round begins with a degauss, since a recipe holds only from that condition. Its maps are averaged
 until the mean is accurate enough. Meanwhile creep goes on, and the electronics quantise. The hysteresis model gives the
 deviation of the effective signals from the wanted ones at each map, and the influence function its effect, which is
-subtracted. What remains of a map is the defect of the model at the effective signals of the shape. That of the next
-shape is estimated from all rounds so far (`converge.defects`): most shapes are right at once, and their only round is
-the one that re-measures them. In the end each recipe uses its neighbours' maps too.
+subtracted. What remains of a map is the model's defect at the effective signals of the shape. The defect of the next
+shape is estimated from all rounds so far (`converge.defects`), so most shapes are right at once and take a single
+round, the one that re-measures them. In the end each recipe uses its neighbours' maps too.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,9 +25,9 @@ from dm_controller.planning.recipes import Corrections, UnreachableError, target
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Shape, measured_shape, rms_sag
 
-#: Deviation of an effective signal, where a limit binds, up to which a recipe keeps the effective signals aimed at.
+#: Largest deviation of an effective signal, due to a limit, at which a recipe still stores those aimed at, not reached.
 MISS_IGNORED = 1e-3
-#: A round ends once the standard error of its mean is this share of the tolerance; fewest maps that show their noise.
+#: A round ends once the standard error of its mean is this share of the tolerance; fewest maps to find that error from.
 SURE_SHARE, MAPS_MIN = 0.2, 3
 
 
@@ -40,7 +40,7 @@ class BuildOptions:
         maps_max: most maps of one recipe: at least one round to correct by and one to re-measure.
         average: most maps of one round; fewer than 2 do not show the noise.
         settle_time: s after the move at which the shape is to be right.
-        reachable: largest coefficient error, m, that limits may leave in a shape reached from the condition.
+        reachable: largest coefficient error, m, that limits may leave in a shape set after the degauss.
     """
 
     tolerance: float = 6.3e-10
@@ -91,8 +91,8 @@ class RecipeBuilder:
 
     Args:
         loop: plans moves; without a hysteresis model its effective signals are signals.
-        now: the plant's time, s, of the clock that maps are stamped with.
-        state: what the mirror remembers, mainly creep; kept up to date; None = demagnetised, long at mid range.
+        now: returns the time, s, of the clock that maps are stamped with.
+        state: of the actuators now, of which the degauss leaves the creep; None = demagnetised, long at mid range.
         on_step: called after each map; `cancelled` before each.
 
     Attributes:
@@ -234,7 +234,7 @@ class RecipeBuilder:
         return taken
 
     def _hold(self, aim: Floats) -> None:
-        """Correct the shape for creep as in use, so that the law's error in that becomes part of the recipe."""
+        """Correct the shape for creep as any held shape is, so that the law's error in creep is part of the recipe."""
         law = self._loop.law
         if not law.has_history:
             return
@@ -252,10 +252,10 @@ def recipe_book(
     """Recipes of one run as a book; its interpolation error is that of these together with the recipes `before`.
 
     Args:
-        loop: of the calibration as it is now, which may have taken in the recipes' own maps while they were built.
+        loop: planner of the present calibration, which the recipes' own maps may have updated meanwhile.
 
     Raises:
-        RecipeError: those were made under another condition.
+        RecipeError: the recipes `before` begin with another degauss.
     """
     known = [replace(recipe, by_model=loop.mirror.command(target_of(recipe))[0]) for recipe in recipes]
     ordered = sorted(known, key=lambda recipe: recipe.shape)

@@ -26,7 +26,7 @@ from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import recipe_targets
 
-#: Longest wait for an answer of the calibration node, which stores recipes, and for that node to return, s.
+#: Longest wait for the answer of the calibration node, which stores the recipes, and for its return after a crash, s.
 STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
 #: Time for the calibration node to judge the last map, half a second after its stamp, and to publish the result, s.
@@ -127,7 +127,7 @@ class RecipeRun:
         return code, "; ".join(filter(None, (text, figures, rest)))
 
     def _planner_now(self, active: ActiveCalibration) -> Planner:
-        """The planner of the calibration of these recipes, which may have taken in their maps meanwhile."""
+        """The present planner of the recipes' calibration, which their maps may have updated meanwhile."""
         with suppress(Refusal):
             now = self._bench.active_calibration()
             if now.calibration.id == active.calibration.id:
@@ -148,8 +148,8 @@ class RecipeRun:
     def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
         """Ask the calibration node to store the recipes; returns its ErrorCode and sentence.
 
-        If it has died, its return is waited for; after a restart, until it has loaded its calibration. Without an
-        answer it is asked again: a node that has just started loses answers to clients that it has not discovered yet.
+        Waits for a node that has died to return and to load its calibration. Repeats a request without an answer: a
+        node that has just started loses answers to clients that it has not discovered yet.
         """
         deadline = time.monotonic() + RETURN_S
         while True:

@@ -29,7 +29,7 @@ NO_TILT = (
     "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
     "camera's picture moves with the focus; calibrate from maps that keep their tilt, or set hold_tilt = false"
 )
-#: Largest relative difference between the span of effective signals in a full cycle and that of the signals.
+#: Largest relative difference between the spans of effective signals and of signals in a full cycle; more is an error.
 SPAN_TOLERANCE = 0.5
 
 
@@ -40,7 +40,7 @@ class ActiveCalibration:
     Attributes:
         calibration: as received.
         mirror: its influence function inside the limits.
-        certain: the same inside the limits that are within reach from any history.
+        certain: the same inside limits that the effective signals can reach from any history.
         planner: of its moves.
         recipes: may be empty.
     """
@@ -57,7 +57,7 @@ class ActiveCalibration:
         return self.mirror.limits.middle
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
-        """See :meth:`CalibratedMirror.reachable_range`; within reach from any history."""
+        """See :meth:`CalibratedMirror.reachable_range`; only what can be reached from any history."""
         return self.certain.reachable_range(target, tolerance)
 
     def degauss_steps(self, configured: int) -> int:
@@ -75,7 +75,7 @@ class ActiveCalibration:
         return self.corrections.worst if self.recipes.recipes else 0.0
 
     def note_creep_shown(self, before: "ActiveCalibration | None", state: HysteresisState | None) -> None:
-        """Let bounds count creep only from the last check on, as far as this calibration includes what maps have shown.
+        """Let bounds leave out the creep until the last check, as far as this calibration includes it from maps.
 
         Args:
             before: the calibration used until now; a check that it does not include was made at `state`.

@@ -1,4 +1,4 @@
-"""Bounds of the error by creep that is not known: of the first second, over hours, and of shapes held unobserved."""
+"""Bounds of errors from creep that is not known: in the first second, over hours, and from shapes held unobserved."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from dm_controller.planning.mirror_model import SIGMAS_95
 
 #: Ages of a shape, s, for which a bound holds, besides the moment when it is to be right.
 AGES = (1.0, 10.0, 100.0)
-#: Time after `crept_at` to which the figure refers, including creep left then, s: half of a typical run.
+#: The calibration's figure includes the creep left at this time after `crept_at`, s: half of a typical run.
 IN_FIGURE_S = 200.0
 #: 95 % quantile of the largest of as many independent errors as coefficients, in standard deviations.
 LARGEST = 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
-#: Relative error of creep that is not known better: of elements with time constants (s) below and above these two, if
-#: the calibration has no covariance, and of what was held before the calibration.
+#: Assumed relative error of creep: that of elements with time constants (s) below and above these two, if the
+#: calibration has no covariance, and that of shapes held before the calibration.
 UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, SLOW_S
 
 
@@ -43,7 +43,7 @@ class CreepShown(NamedTuple):
         time: s.
         crept: (N, J) states of the creep elements then.
         sigma: (J,) `crept_sigma` then, see :class:`~dm_common.hysteresis.model.HysteresisState`.
-        share: of the slow creep until then, which the figure includes since.
+        share: share of the slow creep until then that the figure includes since.
     """
 
     time: float
@@ -140,7 +140,7 @@ class CreepError:
 
 
 def _default_covariance(law: HysteresisModel) -> Floats:
-    """Covariances if the calibration has none; its gains include what fast elements follow at once."""
+    """Covariances if the calibration has none; its gains include the creep of fast elements."""
     time = law.creep_time
     share = UNKNOWN_SHARE * np.atleast_2d(law.creep_share).mean(axis=0)
     rows = np.hstack((np.where(time < UNKNOWN_BELOW, -1.0, 0.0)[:, None], np.eye(len(time))))

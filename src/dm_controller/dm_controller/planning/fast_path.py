@@ -1,9 +1,9 @@
 """The fast path from a target to its command: what does not depend on the request is computed in advance.
 
-A mirror waits longer for a request than a request may wait for its command. Both halves give the result of the regular
-path, :meth:`CalibratedMirror.command` and :func:`dm_common.hysteresis.inverse.invert`, or report that it has to be
-taken: where a series is too short, a piece not exact enough, or a limit is met. Together they make planning five times
-as fast.
+There is time between two requests, but a request must not wait for its command. Both halves give the result of the
+regular path, :meth:`CalibratedMirror.command` and :func:`dm_common.hysteresis.inverse.invert`, or report that the
+regular path is needed: where a series is too short, a piece not exact enough, or a limit binds. Together they make
+planning five times as fast.
 
 With a short power series in the radius, all that is linear in the sag of a conic is computed once per mirror:
 
@@ -120,7 +120,7 @@ class PreparedInverse:
         self._apart = state.signals - state.position
         self._rests: dict[float, tuple[Floats, Floats, Floats]] = {}
         parts = pieces(law)
-        # Without the signal itself (half-width 0) there is a dead zone about the state, which no piece describes.
+        # Without an operator of half-width 0 there is a dead zone about the state, which no piece describes.
         self._serves = parts.radius[0] == 0.0
         if self._serves:
             self._prepare(parts)
@@ -193,7 +193,7 @@ class PreparedInverse:
         return np.asarray(piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise)
 
     def _creep(self, time: float, ahead: float) -> tuple[Floats, Floats, Floats]:
-        """As `HysteresisModel.creep_ahead` for the state at `time`, but the second share includes the third."""
+        """As `HysteresisModel.creep_ahead` for the state at `time`, but the second result includes the third."""
         elapsed = max(time - self.state.time, 0.0) + ahead
         known = self._rests.get(ahead)
         if known is None:

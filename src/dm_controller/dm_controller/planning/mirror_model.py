@@ -23,12 +23,12 @@ LEAST_AUTHORITY = 0.01
 #: Ridge on the signals, as a share of a typical actuator's rms response. On a simulated PDM30-37 it costs less than
 #: 1 % of the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
-#: The same if an actuator has no effect: otherwise all others run to the end of their range on its side to hide it.
+#: The same if an actuator has no effect: otherwise all others on its side of the mirror go to their limits to hide it.
 RIDGE_SHARE_STUCK = 0.1
 #: Weight of held tilt relative to the sag beyond the terms: less than that of the coefficients, so that the shape has
 #: precedence where a limit binds.
 TILT_WEIGHT = 10.0
-#: Tilt at the edge, as a share of the largest response, below which maps do not show it; an actuator makes 1.5.
+#: Tilt at the edge, as a share of the largest response, below which the maps hold none; an actuator makes 1.5.
 LEAST_TILT = 0.05
 #: Half-width of a 95 % interval in standard deviations.
 SIGMAS_95 = 1.96

@@ -147,8 +147,8 @@ class Planner:
             # The limits are those of signals, not of effective ones: from this state more or less may be in reach.
             cut = found is None and bool(mirror.limits.at_limit(aim).any())
         else:
-            # What a recipe corrects is an error of the model and none of the mirror: the limits leave what they leave
-            # of the model's own signals, and what they deny the recipe's.
+            # A recipe corrects an error of the model, so the expected error is only what the limits leave with the
+            # model's own signals, plus what they deny of the recipe's signals.
             aim, (own, largest) = effective, mirror.command(target)
         if error is not None:
             largest = min(largest, error)
@@ -198,7 +198,7 @@ class Planner:
         target: FocusTarget | None,
         cut: bool = False,
     ) -> tuple[Floats, Floats | None]:
-        """Signals (N,) for the effective signals `aim`, and what these miss because of limits; None = nothing.
+        """Signals (N,) for the effective signals `aim`, and (N,) the part of `aim` that limits deny; None = nothing.
 
         Where the limits bind, or have `cut` the aim, the signals are those nearest to `target`, or without one to the
         shape of `aim`.

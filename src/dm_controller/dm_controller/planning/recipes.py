@@ -1,7 +1,7 @@
 """Corrections that recipes give for a shape: what the model misses there, and how reliable they are.
 
-A recipe shows what the model's own effective signals miss of one shape. Shapes nearby miss about the same: the
-corrections are samples of a field over effective signals whose differences grow with the root of the distance, as those
+A recipe shows by how much the model's effective signals err for one shape; for nearby shapes they err about as much.
+Corrections are samples of a field over effective signals whose differences grow with the root of the distance, as those
 of a random walk do. Its best linear estimate (kriging: Matheron 1963; Gaussian process regression with the exponential
 covariance) serves every shape near recipes, of whatever kind. The size of the field follows from the error that the
 model promises, and from the recipes: their corrections, and the error of predicting each from the others.
@@ -85,8 +85,8 @@ class Corrections:
     """The corrections that the recipes of `book` show on the mirror of `planner`.
 
     Args:
-        learnt: whether maps have agreed with the calibration since the recipes were built: its changes since then shift
-            them too. Otherwise they stay as they were measured, even where earlier updates are lost.
+        learnt: whether maps have agreed with the calibration since the recipes were built: its updates since then shift
+            the recipes too. Otherwise recipes stay as measured, even if earlier updates are lost.
 
     Raises:
         RecipeError: there are none.
@@ -114,7 +114,7 @@ class Corrections:
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
         missed, left = self._kriging.left_out(self._corrections)
-        # A single recipe is missed by its whole correction; the re-measured error is counted separately.
+        # Nothing predicts a single recipe: its whole correction is the error. The re-measured error is counted apart.
         beyond = np.maximum(self._largest(missed) - self._measured.max(), 0.0) / np.sqrt(left)
         hysteresis, model = planner.hysteresis, planner.mirror.model
         held_out = model.held_out_max_zernike if hysteresis is None else hysteresis.held_out_max_zernike

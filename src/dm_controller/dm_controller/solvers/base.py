@@ -1,8 +1,8 @@
 """What all solvers have in common: shapes, commands, limits, and one correction step.
 
-A solver knows a mirror by its influence function and does two things: it finds signals for a shape without looking
-(`solve`, open loop), and it improves signals by a measured error (`correct`, one step of a closed loop). Both are the
-same question, "which signals change the surface by this much from here?", so a solver answers that one only.
+A solver knows a mirror by its influence function and does two things: it finds signals for a shape without measuring
+(`solve`, open loop), and it improves signals by a measured error (`correct`, one step of a closed loop). Both need the
+signals that change the surface by a given amount from a given start, so that is all that a method implements.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Solver(ABC):
         self.offset = model.offset
 
     def solve(self, wanted: Shape) -> Command:
-        """Signals for a surface, without measuring (open loop): from rest, where the model's offset is the surface.
+        """Signals for a surface, without measuring (open loop): from zero signals, which give the model's offset.
 
         Raises as `correct`.
         """

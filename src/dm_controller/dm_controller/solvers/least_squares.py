@@ -121,7 +121,7 @@ class Bounded(Solver):
         """`mirror`: for that model and those limits; it knows whether tilt is held and about which axis."""
         super().__init__(model, limits)
         self._mirror = mirror or CalibratedMirror(model, limits)
-        # A correction must not change signals on which the error has no bearing: its rows weigh moves, not signals.
+        # A correction must not change signals that have no effect on the error: its rows weigh moves, not signals.
         self._miss = miss_rows(self._mirror.matrix)
         self._correction = BoundedProgramme(np.vstack([self._mirror.matrix, self._miss]), limits, ridge=TINY**2)
 

@@ -1,1 +1,1 @@
-"""Who may command the mirror, and the requests that take a while."""
+"""Which commands are accepted, who holds the mirror, and the action `degauss`."""

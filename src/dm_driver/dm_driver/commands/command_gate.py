@@ -12,7 +12,7 @@ from dm_driver.moves import Outcome
 
 Result = TypeVar("Result")
 
-#: Time for the electronics beyond what a ramp takes, s.
+#: Time allowed to the electronics on top of the duration of a ramp, s.
 MARGIN_S = 2.0
 
 CODE_OF_OUTCOME = {

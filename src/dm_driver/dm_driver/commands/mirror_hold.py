@@ -1,4 +1,4 @@
-"""One holder of the mirror at a time: who it is, and what everybody else is told meanwhile. Knows no node.
+"""One holder of the mirror at a time: who it is, and the refusal for everybody else meanwhile. Knows no node.
 
 A calibration is lost if a stray focus request moves the mirror meanwhile. So whoever needs the mirror for a while holds
 it: commands of others are refused, with a sentence that says who holds it, for how long, and how to end that. A hold is

@@ -46,8 +46,8 @@ class ElectronicsSettings:
     Attributes:
         timeout_s: longest wait for the unit to take a frame or to answer.
         frame: of a framed serial unit.
-        doubt: codes by which frames under way may differ from what has surely arrived, if a back end knows that; 0 =
-            any.
+        doubt: largest difference, in codes, of frames under way from what has certainly arrived, for back ends that
+            know what has; 0 = any.
         channels: output channels of a unit that has as many as it has actuators.
     """
 
@@ -92,8 +92,8 @@ class DriveElectronics(ABC):
     max_code: int
     #: The field of the settings without which the unit cannot be reached, and what it must be.
     needs: tuple[str, str]
-    #: Frames per `limits.step` of a ramp: more than one if a frame may be lost unnoticed, so that the next frame is
-    #: then no larger step.
+    #: Frames into which a ramp divides a change of `limits.step`: more than one where a frame may be lost unnoticed, so
+    #: that the change to the next frame still is no larger.
     frames_per_step: int = 1
     #: Highest frame rate of the link, Hz, from which times are predicted. Infinite = not known.
     frames_per_second: float = math.inf
@@ -211,7 +211,7 @@ class DriveElectronics(ABC):
         try:
             self._do_close()
         except OSError:
-            pass  # it is gone either way
+            pass  # the link is gone anyway
 
     @abstractmethod
     def _do_open(self) -> None:

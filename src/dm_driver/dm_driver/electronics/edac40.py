@@ -25,7 +25,7 @@ CHANNELS: Final = 40
 MAX_CODE: Final = 0xFFFF
 COMMAND_VALUE: Final = 0
 
-#: Pause between two checks for an acknowledgement; a direct cable takes 0.1 to 0.3 ms [s].
+#: Pause between two checks for an acknowledgement, s; one takes 0.1 to 0.3 ms over a direct cable.
 _ACKNOWLEDGEMENT_PERIOD_S: Final = 1e-4
 #: Number of times that a frame over UDP is repeated, once at each check of the link, while it is the last one.
 _REPEATS: Final = 2
@@ -80,10 +80,10 @@ class _Edac40(DriveElectronics):
 class Edac40Tcp(_Edac40):
     """EDAC40 over TCP. The unit takes one client at a time.
 
-    When a unit vanishes, it is not known which of the frames under way it took. The shape that is sent when it is back
-    must be no step for it. So a frame that differs from what has surely arrived by more than half of `doubt` waits for
-    the acknowledgement by the unit's TCP: whichever frame is at the outputs, the last one is then at most `doubt`
-    away. Small changes never wait.
+    When a unit vanishes, it is not known which of the frames under way it took, but the last frame, which is sent again
+    when the unit is back, must not be a large step from its outputs. So a frame that differs from what has certainly
+    arrived by more than half of `doubt` waits for the acknowledgement by the unit's TCP: the last frame is then at most
+    `doubt` away from any frame that may be at the outputs. Small changes never wait.
     """
 
     _protocol = "TCP"
