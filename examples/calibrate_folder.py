@@ -24,5 +24,5 @@ calibration = calibrate(folder, commands, mirror=mirror)
 print(f"{len(calibration.maps)} maps, {calibration.fit.held_out_rms * 1e9:.2f} nm rms on maps held out")
 print("influence function, m per unit signal:", calibration.fit.influence_zernike.shape)
 print(*calibration.limitations, sep="\n")
-# Not beside the maps: the file ends in .h5 as some of these do. Copied to calibration_folder, the node loads it.
+# In a folder of its own, since map files may end in .h5 too. The node loads it once it is in calibration_folder.
 print("stored as", CalibrationStore(folder / "calibrations").save(calibration))

@@ -25,7 +25,7 @@ sent: list[tuple[float, np.ndarray]] = []  # s, and signals (N,)
 
 
 def send(signals: np.ndarray) -> np.ndarray:
-    """Your electronics take the place of this: send signals (N,), return what these made of them."""
+    """Put your electronics in place of this: send signals (N,), and return them as the electronics quantised them."""
     sent.append((time.time(), signals))
     return signals
 

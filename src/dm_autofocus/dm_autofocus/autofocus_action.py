@@ -26,7 +26,7 @@ from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, from_values, reals
 
-#: Errors of moves while a controller that died is away, and until the new one has received all that it needs.
+#: Errors of moves after the controller has died, until a new one has calibration and driver.
 _AWAY = (ErrorCode.TIMEOUT, ErrorCode.NODE_INACTIVE, ErrorCode.DRIVER_UNAVAILABLE, ErrorCode.NOT_CALIBRATED)
 #: Largest uncertainty of a move's curvature, in depths of focus, for which moves count as accurate.
 TRUSTED = 2.0

@@ -4,8 +4,8 @@ A sphere of the curvature c has the slope c p at the distance p from its vertex,
 point is shifted by twice the mean slope over the part of the mirror that the camera uses. So if a camera looks beside
 the middle of the calibrated aperture, its picture moves while the focus changes, by equal distances for equal changes.
 Two small deliberate tilts show how far, and in which direction, the picture moves for a known tilt: pixel pitch, focal
-length, relay and the camera's roll need not be known. Images are compared in pairs of equal blur: half a step before
-and behind the focus.
+length, relay and the camera's roll need not be known. Images are compared in pairs of equal blur: at opposite tilts in
+the focus, and one step below and above the focus.
 
 Shifts are found from the phase of the cross-power spectrum [34]. Only low spatial frequencies are used: their phase is
 that of the mean slope, while that of higher ones is affected by aberrations.
@@ -25,7 +25,7 @@ LOWEST, HIGHEST = 1.5, 0.1
 TILT = 2.5e-7
 #: Defocus to either side of the focus, in depths of focus: images are still sharp enough.
 STEP = 4.0
-#: Shifts by tilts must be this many times their uncertainty, and those by equal tilts may differ by this factor.
+#: Least ratio of a shift by tilt to its uncertainty; largest ratio of the shifts by equal tilts in two directions.
 SIGNIFICANT, ANISOTROPY = 5.0, 2.0
 #: Iterations of the fit of a phase that is known modulo 2 pi.
 ROUNDS = 4

@@ -29,7 +29,7 @@ from dm_common.ros.clients import MirrorHolder, ServiceCallError
 #: Profile that cameras publish with; depth 1: an image that was not fetched in time is replaced by the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-#: Images in a row that cannot be used, as when a few bytes are lost, that do not end an action.
+#: Most unusable images in a row, as when a few bytes are lost, that do not end an action.
 DAMAGED_MAX = 2
 
 
@@ -53,7 +53,7 @@ class FocusProbe:
     Attributes:
         controller: whether the focus controller is present.
         capabilities: the latest of the controller; None before the first.
-        shape: the last one taken: curvature [1/m], NaN before; conic constant; terms [m] if `focus_request` gave them.
+        shape: the last that the driver took: curvature [1/m] (NaN = none yet), conic constant, terms [m] if known.
         user: action that holds the mirror; "" = none does.
         target: curvature that `move` requested last [1/m]; NaN while nobody holds the mirror.
         topic: of the images.
@@ -70,7 +70,7 @@ class FocusProbe:
         self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
         self.shape: tuple[float, float, Sequence[float]] = (math.nan, 0.0, ())
-        self._asked_for = FocusRequest()  # the last one on that topic
+        self._asked_for = FocusRequest()  # the latest on focus_request
         self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0

@@ -1,4 +1,4 @@
-"""Images of a camera: their grey levels as arrays, and which of them show the focus that was asked for."""
+"""Images of a camera: their grey levels as arrays, and which of them show the requested focus."""
 
 import io
 import math

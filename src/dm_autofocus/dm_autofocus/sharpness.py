@@ -19,7 +19,7 @@ WHOLE: Region = (0.0, 0.0, 1.0, 1.0)
 
 #: Most pixels that enter one figure; of larger regions only every n-th row is used.
 PIXEL_BUDGET = 400_000
-#: Smallest mean of grey levels, as a share of that of their sizes.
+#: Smallest mean of grey levels relative to that of their absolute values: below it, negative levels cancel the others.
 CANCELLED = 0.5
 #: Smallest region [px along a side] that has a gradient.
 SMALLEST = 3

@@ -39,9 +39,9 @@ DISCOVERY_S = 3.0
 
 
 def start_nodes(context):
-    """One action a node; the virtual bench and the autofocus only where the file has a section for them."""
+    """One action per node; the virtual bench and the autofocus only where the file has a section for them."""
     values = {name: LaunchConfiguration(name).perform(context) for name, _default, _text in LAUNCH_ARGUMENTS}
-    # A debugger or the like that the user puts before the commands comes with a filter of its own.
+    # None: launch puts the user's own launch-prefix, such as a debugger, before the commands, with its filter.
     prefix = None if LaunchConfiguration("launch-prefix", default="").perform(context) else HELD_SIGNALS
     actions = []
     pushed = LaunchConfiguration("ros_namespace", default="").perform(context)  # PushRosNamespace around this file

@@ -210,8 +210,8 @@ class Connection:
     def call(self, name: str, request: Any, timeout_s: float | None = None, again: bool = False) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer.
 
-        A node just started may lose a request: with `again`, for requests that may be carried out twice, it is sent
-        again once an answer that should come at once is late.
+        A node that has just started may lose a request: with `again`, for requests that may be carried out twice, it is
+        sent once more if no answer comes within the client's `timeout_s`.
         """
         with self._answered(name, ActionClient) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
@@ -264,7 +264,7 @@ class Connection:
     def _answered(self, name: str, not_a: type) -> Iterator[Callable[[], str]]:
         """Raise DeformableMirrorError if `name` does not answer, or has a client of the kind `not_a`.
 
-        Yields a function: why its node is gone since now.
+        Yields a function that returns why its node has gone since then; "" = it has not.
         """
         self._check_open()
         if self._background.is_here:

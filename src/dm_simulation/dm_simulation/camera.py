@@ -61,7 +61,7 @@ class SceneCamera:
 
     Args:
         config: camera and scene.
-        pupil_diameter: of the part of the mirror that is used, m.
+        pupil_diameter: diameter of the part of the mirror that is used, m.
         scene_rng: draws the textures once.
         noise_rng: draws the noise of each image.
 

@@ -27,7 +27,7 @@ TILE_MAX, TILE_MIN, TILES = 256, 24, 3
 BANDS, LOWEST = 20, 2.5
 #: Samples of the transfer per band, nodes of its integral, and step of its table in depths of focus.
 SAMPLES, NODES, STEP = 5, 96, 0.25
-#: The transfer of a real pupil may be anything up to the largest ideal one over defocuses that differ by this share.
+#: The transfer of a real pupil may reach the largest ideal one among defocuses that differ by up to this share.
 SPREAD = 0.17
 
 #: Relative error of the transfer; of the noise, between images; share of power that leaks in from lower bands.
@@ -42,7 +42,7 @@ TINY = 1e-18
 SCALES = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 #: Largest distance from the focus of images that are used, in steps of the table.
 FITTED = 48.0
-#: How much better another focal length must explain the images to be named (twice a log ratio).
+#: By how much another focal length must lower the misfit to be reported (twice a log-likelihood ratio).
 BETTER = 60.0
 
 

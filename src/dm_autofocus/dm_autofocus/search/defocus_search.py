@@ -4,8 +4,8 @@ A state machine as `PeakSearch`, for a mirror that reaches the curvatures it is 
 every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
 the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
 probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
-confirms it: the top must be sharper than both. The result is the mean of the probability that the images near it give,
-two on either side: with a pupil that is not ideal, both sides err by the same amount in opposite directions.
+confirms it: the top must be sharper than both. The result is the mean of the probability density that follows from the
+images near it, two on either side: the errors of a pupil that is not ideal are equal and opposite on the two sides.
 """
 
 import math
@@ -26,7 +26,7 @@ from dm_autofocus.search.peak_search import (
 )
 from dm_common import Bools, Floats
 
-#: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
+#: By how much a place must explain the images better than a scene that focus does not change (2 x log likelihood).
 EVIDENCE = 25.0
 #: The same when the search ends. Of 4160 scenes without anything to see, 14 reached 26 to 42 by chance; scenes with a
 #: texture of 5 % contrast and more end at 100 or above.
@@ -40,8 +40,8 @@ MOST_IMAGES, EXPECTED_IMAGES = 18, 10
 SIDE, SIDE_MAX, BEYOND = 3.0, 9.0, 10.0
 #: Share of the least power of all images that may have blurred in from outside the region.
 STRAY = 0.5
-#: An image is near the focus if it rises this many times as far above the least sharp one as all images further away
-#: than HILL depths of focus, of which there must be at least FAR_IMAGES.
+#: Only images within HILL depths of focus of the sharpest count, if it exceeds the least sharp one by OUTSTANDING times
+#: as much as all images further away do, of which there must be at least FAR_IMAGES.
 OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
 #: Places of the last images, and of further ones while the standard error is above PRECISION, in steps.
 LAST, MORE = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6)

@@ -19,7 +19,7 @@ from dm_autofocus.search.peak_search import Peak, SearchConfig, Step
 from dm_common import Floats
 from dm_common.values import parameter, real, whole
 
-#: Share by which the normal sharpness follows each image.
+#: Share of the difference by which the normal sharpness follows each image.
 FORGETTING = 0.02
 #: After a change the centre goes back by this many images: somebody who walks in changes little at first.
 BEFORE = 6
@@ -33,7 +33,7 @@ SPEEDS = 5.0 * np.arange(-3, 4)
 STEP_BACK = 0.25
 #: Standard deviations of the previous estimates of place [depths of focus] and speed [depths of focus per second].
 PLACE_SIGMA, SPEED_SIGMA = 3.0, 8.0
-#: Share by which the period follows each image, and longest one that counts [s].
+#: Share of the difference by which the mean period follows each image, and longest period that counts [s].
 PERIOD_SHARE, PERIOD_MAX = 0.3, 0.3
 
 

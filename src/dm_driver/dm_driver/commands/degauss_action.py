@@ -22,7 +22,7 @@ POLL_S, FEEDBACK_S = 0.02, 0.1
 
 
 class DegaussAction:
-    """Serves `degauss` in worker threads; a newer permitted goal pre-empts, and after a cancel the mirror slews back."""
+    """Serves `degauss` in worker threads; a newer permitted goal pre-empts, after a cancel the mirror slews back."""
 
     def __init__(self, node: Node, gate: CommandGate, values: Mapping[str, Any]) -> None:
         self._gate, self._values = gate, values

@@ -86,7 +86,7 @@ class JilesAthertonHysteresis:
 
     Walls are pinned: m approaches that curve only on moves towards it, the more slowly the stronger the pinning, and
     follows a share of its slope reversibly. Minor loops neither close nor erase earlier turning points. Simplified: m
-    adds to the signal, but not to its change. All share the step of the farthest move, which makes 3 nm at most.
+    adds to the signal, but not to its change. All take the steps of the longest move, which errs by 3 nm at most.
 
     Args:
         width, pinning, reversible, coupling: (N,) width of tanh, pinning, reversible share, weight of m in the signal.

@@ -25,7 +25,7 @@ from dm_simulation.mirror.zernike import Array
 EPSILON = 8.8541878128e-12
 #: Quadrature points over an electrode, along its radius and around it: accurate to 1e-9 of its load.
 _RADII, _ANGLES = 6, 16
-#: Deflection, as a share of the gap, beyond which the pull grows faster than the tension.
+#: Deflection, as a share of the gap, beyond which the pull grows faster than the restoring force of the tension.
 NEAREST = 1 / 3
 #: Most iterations of gap and pressure, and the change of the deflection, as a share of the gap, that ends them.
 _ROUNDS, _SETTLED = 100, 1e-9
@@ -63,7 +63,7 @@ class Membrane:
         radius: m.
 
     Raises:
-        ValueError: the electrodes do not form full rings, or extend beyond the membrane, or full volts pull it there.
+        ValueError: electrodes do not form full rings or extend beyond the membrane, or full volts pull it onto them.
     """
 
     def __init__(
