@@ -25,7 +25,7 @@ def region_of(text: str) -> tuple[float, ...]:
 
 
 def price(client: Any, axis: Any) -> dict[str, Any]:
-    """Cost of holding the picture: reachable curvatures [1/m] and residual [nm rms], with held and with free tilt."""
+    """Cost of a still picture: reachable curvatures [1/m] and residual [nm rms], with held and with free tilt."""
     from dm_controller.planning.active_calibration import active_calibration
     from dm_controller.planning.target import FocusTarget
 

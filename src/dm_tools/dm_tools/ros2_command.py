@@ -23,6 +23,6 @@ class DmCommand:
         return 0
 
     def _run(self, words: list[str], name: str) -> None:
-        from dm_tools.cli import run  # `ros2` makes every command to list them
+        from dm_tools.cli import run  # imported late, since `ros2` creates every command just to list them
 
         run(words, name)

@@ -136,9 +136,9 @@ def holder(client: DeformableMirrorClient) -> str:
 
 @contextmanager
 def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
-    """Add to the error of a request that is refused within who holds the mirror, and how to end that.
+    """Add to the error of a request that is refused in this block who holds the mirror, and how to end that.
 
-    The same holds for NOT_CALIBRATED: while the first calibration runs, that alone does not explain the refusal.
+    NOT_CALIBRATED is treated as BUSY is: while the first calibration runs, it alone does not explain the refusal.
     """
     from dm_client import DeformableMirrorError
 
@@ -180,9 +180,9 @@ class SettledShape(NamedTuple):
         curvature: 1/m.
         seconds: since its command.
         bound: m, 95 % bound on its largest coefficient error.
-        held: creep is fed forward.
+        held: it is corrected for creep.
         predicted: m, the part of that error that was predicted: it is due to the limits, and maps should show it.
-        conditioned: it was taken from the degaussed mirror, by a recipe where there is one.
+        conditioned: it was set after a degauss, by a recipe where there is one.
     """
 
     curvature: float

@@ -1,4 +1,4 @@
-"""Compare a measured surface with the one that was asked for."""
+"""Compare a measured surface with the requested one."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -13,7 +13,7 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import ESTIMATES_KEPT, ActuatorEstimate
 from dm_common.messages import estimate_from, hysteresis_model_from, seconds
 
-#: Creep left by unobserved shapes is reported above this standard deviation, in shapes of the whole range.
+#: Creep left by shapes held unobserved is reported above this standard deviation, as a share of a full-range shape.
 CREEP_UNSEEN = 0.05
 #: A move that is not in the controller's estimate after this time counts as not followed, s.
 LATE_S = 1.0

@@ -25,8 +25,8 @@ class SurfaceView:
         version: rises whenever something changed.
         measured, predicted, difference: surfaces, or the reason why there is none. `predicted` is for now,
             `difference` for the moment of the map.
-        predicted_then: for the moment of the map; None = not known.
-        predicted_zernike: (K,) m for the moment of the map; None = not known.
+        predicted_then: surface predicted for the moment of the map; None = not known.
+        predicted_zernike: (K,) m predicted for the moment of the map; None = not known.
         remark: on what the prediction leaves out, in words; "" = nothing.
         stamp: ns, of the map; 0 = none.
         when: whether the map is of the present shape, in words.

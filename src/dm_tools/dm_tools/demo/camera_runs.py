@@ -21,7 +21,7 @@ from dm_tools.verbs.up import DISTANCES
 
 #: Speed at which the nearest object approaches [m/s], and the distance at which it stops [m].
 SPEED, NEAREST = 0.7, 4.5
-#: Time for the mirror to settle before an image is looked at, s.
+#: Time for the mirror to settle before an image is taken, s.
 SETTLE_S = 0.3
 #: Number of images kept until `autofocus_state` reports on them.
 WAITING = 60

@@ -14,7 +14,7 @@ from dm_bringup.nodes import NODES
 from dm_tools.running_suite import BUSY_S, NEEDED, heard, nodes_of_suite, where
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
-#: Virtual bench, autofocus and every program take a segment of 16 MB in /dev/shm, see config/fastdds.xml.
+#: Least free space in /dev/shm, B: virtual bench, autofocus and every program take 16 MB each (config/fastdds.xml).
 SHARED_MEMORY_MIN = 60e6
 DISK_MIN = 1e9
 #: What the suite keeps in ~/.ros unless configured otherwise.
@@ -143,7 +143,7 @@ def messages() -> Finding | None:
 
 
 def running_nodes(namespace: str = "") -> Finding:
-    """Running nodes of the suite: twice is wrong, none is a note, and a clock that differs from ours is wrong."""
+    """Running nodes of the suite: none is a note; one that runs twice, or whose clock differs from ours, is wrong."""
     from dm_client import DeformableMirrorClient
 
     with DeformableMirrorClient(namespace) as client:

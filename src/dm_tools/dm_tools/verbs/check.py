@@ -47,9 +47,9 @@ def check(
         raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
         health = hear_health(client)
-        # The bound of the present shape as it was promised before the map, which may widen it, and not the one that the
-        # calibration promises for any shape. Its predicted part is subtracted, because the map is compared with the
-        # prediction. A recipe is right where the model is not, so that of a conditioned shape is the model's bound.
+        # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
+        # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
+        # another surface than the model predicts, so for a conditioned shape the model's bound counts.
         patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
         client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
@@ -57,7 +57,7 @@ def check(
         calibration = client.latest("calibration")
     # The map is compared by the history known to the node `calibration`, which may have run for longer.
     lost = unknown_history(capabilities)
-    if lost or capabilities is None:  # the promise of a focus controller that knew as much as that node
+    if lost or capabilities is None:  # what a focus controller with that node's knowledge would promise
         promised = promise_of(calibration)
     elif shape is None or shape.conditioned:
         promised = capabilities.error_bound

@@ -18,7 +18,7 @@ from dm_tools.parameter_changes import keep_before
 
 #: Columns of tables that hold no numbers.
 _TEXTS = ("file", "reference", "part")
-#: Where values without a heading go.
+#: Key of the values of a row that have no heading.
 _SURPLUS = "..."
 
 

@@ -17,7 +17,7 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
-#: Transient refusals of a prediction, which say nothing about the wish, and the time until it is tried again, s.
+#: Transient refusals of a prediction, which say nothing about the shape, and the time until it is tried again, s.
 PASSING, AGAIN_S = (ErrorCode.TIMEOUT, ErrorCode.BUSY, ErrorCode.DRIVER_UNAVAILABLE), 2.0
 
 
@@ -28,8 +28,8 @@ class FocusCard:
         self._session = session
         self._range: tuple[float, float] | None = None
         self._asked = self._asking = self._typing = False
-        self._wish: tuple[object, ...] = ()  # and everything else that a prediction depends on
-        self._predicted: tuple[object, ...] = ()  # the wish alone
+        self._wish: tuple[object, ...] = ()  # the fields, and everything else that a prediction depends on
+        self._predicted: tuple[object, ...] = ()  # the fields of the latest prediction
         with card("Focus"):
             self._text = Line("text figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
@@ -90,7 +90,7 @@ class FocusCard:
             background_tasks.create(self._predict())
 
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
-        """What a prediction depends on beside the wish: bounds, recipes, signals, known history, running operation."""
+        """What a prediction depends on beside the fields: bounds, recipes, signals, known history, operation."""
         able, state, book = snapshot.capabilities, snapshot.actuator_state, snapshot.recipes
         promised = (able.calibration_id, able.error_bound, able.error_bound_conditioned) if able is not None else ()
         recipes = (len(book.recipes), str(book.stamp)) if book is not None else ()
