@@ -32,8 +32,8 @@ def build_recipes(
     """Recipes of these curvatures, built on the bench in its present state, and the refusals of the other curvatures.
 
     Args:
-        on_map: called with each map, and the effective signals at that time. Its changes of the calibration do not
-            enter `by_model` of the recipes.
+        on_map: called with each map, and the effective signals at that time. If it changes the calibration, `by_model`
+            of the recipes does not follow.
     """
     tracker, history = HysteresisTracker(planner.law), AppliedHistory()
     history.follow(planner.law)

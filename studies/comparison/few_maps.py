@@ -28,8 +28,8 @@ HYSTERESIS, HADAMARD, PUSH_PULL = "hysteresis", "Hadamard", "push-pull"
 METHODS = (HYSTERESIS, HADAMARD, PUSH_PULL)
 #: Half-swing of a pattern: neighbours that move in opposite directions stay within the shipped limit.
 HALF_SWING = 0.499
-#: Number of requests to each calibration, s for which each is held, and m within which its error should be: a
-#: two-hundredth of the wavelength.
+#: Number of requests to each calibration; time for which each is held, s; largest error of a good one, m: the
+#: wavelength of the interferometer / 200.
 REQUESTS, DWELL, GOAL = 20, 1.0, 632.8e-9 / 200
 
 

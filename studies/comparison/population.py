@@ -2,7 +2,7 @@
 
 Every mirror is calibrated by the plan HYSTERESIS at the limits that ship, and then goes through random requests inside
 the range that it publishes; the true surface is judged when each request's dwell ends. The requests reach the same
-planner as on the bench, with the calibration as the message says it.
+planner as on the bench, with the calibration read from its message.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from studies.comparison.true_surface import TrueSurface
 REACHABLE_TOLERANCE = 2e-8
 #: Times that shapes are held, s.
 DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
-#: Largest curvature asked for, 1/m, and largest sum of added terms, m.
+#: Largest requested curvature, 1/m, and largest requested sum of added terms, m.
 CURVATURE_MAX, ADDED_MAX = 0.05, 3e-7
 #: Number of terms added to every other request.
 ADDED_TERMS = 3

@@ -50,7 +50,7 @@ class SimulatedBench:
 
     Attributes:
         mirror: as the calibration knows it.
-        limits: as solvers know it.
+        limits: of its signals, as solvers take them.
         piezo: its actuators, which only an experiment may touch.
         time: s since the start.
         maps: maps taken so far.

@@ -8,7 +8,7 @@ from typing import Any
 
 from dm_tools.output import console, progress_bar
 
-#: Scenes without texture for each scene with: false finds should be rare.
+#: Scenes without texture for each scene with texture: false finds are rare, so counting them takes many.
 BLANK_SCENES = 20
 
 

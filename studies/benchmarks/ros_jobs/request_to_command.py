@@ -28,8 +28,8 @@ from studies.benchmarks.timing import Effort
 LAW = "Preisach"
 #: Largest curvature requested, 1/m: reachable, some actuators at their limits.
 REACH = 0.03
-#: Pause between two requests, s: for the work that the node does after a command; and such that each of two peers gets
-#: some 100 requests a second.
+#: Pauses between two requests, s: one that lets the node finish its work after a command, and one with which each of
+#: two peers gets some 100 requests a second.
 PAUSE_S, CAMERA_PAUSE_S = 1e-3, 4e-3
 #: Number of requests for each peer in one block; figures are medians over blocks.
 BLOCK = 150
