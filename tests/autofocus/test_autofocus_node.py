@@ -492,6 +492,17 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
     assert result.result().result.curvature == pytest.approx(-0.03, abs=0.002)
 
 
+def test_tracking_that_has_nothing_left_to_see_searches_what_comes(scene: FilmedScene, observer: Observer) -> None:
+    _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    texture = scene.texture.copy()
+    for place, coming in ((0.0173, 100.0), (0.0253, texture)):
+        scene.object_curvature, scene.texture[:] = place, coming
+        wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_COARSE, 30, "a new search")
+        wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    assert not result.done() and scene.states[-1].curvature == pytest.approx(0.0253, abs=0.002)
+
+
 def test_tracking_is_not_ended_by_a_goal_that_cannot_be_nor_by_a_range_that_narrows(
     scene: FilmedScene, observer: Observer
 ) -> None:

@@ -172,10 +172,11 @@ class AutofocusAction(ProbeAction):
                     tracker = self._tracker(peak, config, region)
             except Refusal as error:
                 if error.error_code == ErrorCode.NOT_CONVERGED:
-                    # Nothing to focus on: the present sharpness becomes the new reference.
+                    # Nothing to focus on: the present sharpness becomes the new reference, until something comes.
                     peak = Peak(tracker.centre, sample.sharpness, False)
                     position = math.nan
                     tracker = self._tracker(peak, config, region)
+                    tracker.found = False
                 elif error.error_code in _AWAY and self._probe.controller.changed_within(START_GRACE_S):
                     self._log.warning(f"tracking waits: {error}", throttle_duration_sec=5.0)
                     time.sleep(0.1)

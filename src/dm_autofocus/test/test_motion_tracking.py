@@ -10,7 +10,7 @@ from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
 
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.peak_search import Peak, SearchConfig
-from dm_autofocus.search.tracking import BEFORE, MotionTracker, TrackConfig
+from dm_autofocus.search.tracking import BEFORE, MotionTracker, TrackConfig, Tracker
 from dm_autofocus.sharpness import tenengrad
 
 LOW, HIGH = -0.05, 0.05
@@ -106,3 +106,18 @@ def test_what_is_seen_no_more_is_lost(model: DefocusModel) -> None:
     assert other.lost, "images of another size"
     with pytest.raises(ValueError, match="finite"):
         other.feed(math.nan, (blank,), 0.0)
+
+
+@pytest.mark.parametrize("kind", [Tracker, MotionTracker])
+def test_what_comes_where_nothing_was_found_is_searched(kind: type[Tracker], model: DefocusModel) -> None:
+    """Be it sharper: blurred as it is, it would become the normal sharpness of a place without anything in focus."""
+    camera, blank = DefocusedCamera(clouds(3), 0.015), DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0)
+    known = (model,) if kind is MotionTracker else ()
+    before = Peak(0.0, tenengrad(blank.expose(0.0)), False)
+    tracker = kind(before, SearchConfig(LOW, HIGH, DEPTH), TrackConfig(), *known)
+    tracker.found = False
+    for number in range(60):
+        image = (blank if number < 10 else camera).expose(tracker.step.curvature)
+        tracker.feed(tenengrad(image), (image,), number * PERIOD)
+        assert not (tracker.lost and number < 10 + 30), "nothing has come yet, or it may only pass by"
+    assert tracker.lost

@@ -71,11 +71,13 @@ class Tracker:
         step: where to measure next.
         lost: a new search is needed.
         hidden: the sharpness changed suddenly, and may return.
+        found: whether there is an object at the peak; False = a search found none: what comes is searched.
     """
 
     def __init__(self, peak: Peak, search: SearchConfig, config: TrackConfig) -> None:
         self.centre, self.sharpness = peak.curvature, peak.sharpness
         self.lost = self.hidden = False
+        self.found = True
         self._search, self._config = search, config
         self._dither = config.dither * search.tolerance
         self._changed, self._since = 0, math.nan
@@ -144,7 +146,7 @@ class Tracker:
         if not self.hidden:
             self.hidden, self._since, self.centre = True, time, self._before[0]
         if not time - self._since < self._config.wait:  # without times it counts as lost at once
-            self.lost = self.lost or dull
+            self.lost = self.lost or dull or not self.found
             if not dull:
                 self.sharpness, self._changed, self.hidden = sharpness, 0, False
 
