@@ -356,6 +356,9 @@ def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
         with pytest.raises(DeformableMirrorError, match=r"no texture.* largest value, 255") as blank:
             client.focus_stack(images=5)
         assert blank.value.error_code == ErrorCode.NOT_CONVERGED
+        scene.render = lambda c: gaussian_filter(scene.texture, 0.6 + 100 * (0.06 - c), mode="wrap").astype(np.uint8)
+        with pytest.raises(DeformableMirrorError, match="all that has texture in the image is nearer than the range"):
+            client.focus_stack()
 
 
 def test_compressed_images_are_taken_as_they_come(start: Start, observer: Observer) -> None:

@@ -63,6 +63,8 @@ class FocusStackAction(ProbeAction):
         if not seen.size:
             fault = exposure_fault(grey(image))
             reason = "focus changes nothing in the image: no texture in it"
+            if np.isneginf(depth).any():
+                reason = "all that has texture in the image is nearer than the range reaches"
             raise Refusal(ErrorCode.NOT_CONVERGED, f"{reason}; {fault}" if fault else reason)
         self._publish_stack(image, stack.image, depth)
         result.share = seen.size / depth.size
