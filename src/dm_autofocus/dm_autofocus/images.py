@@ -63,6 +63,8 @@ STAMP_AHEAD = 0.5
 #: Encodings by the modes to which Pillow decodes images, "I" for 16 bits before its version 10.3; images of other modes
 #: are converted to RGB.
 MODES = {"L": "mono8", "I;16": "mono16", "I": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
+#: Formats that compressed_image_transport sends. Pillow knows many more, and starts Ghostscript for one of them.
+FORMATS = ("JPEG", "PNG", "TIFF")
 
 
 def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
@@ -78,7 +80,7 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
     import PIL.Image  # imported here: needed for compressed images only
 
     try:
-        with PIL.Image.open(io.BytesIO(data)) as image:
+        with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
             decoded = image if image.mode in MODES else image.convert("RGB")
             pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
             if decoded.mode == "I":
