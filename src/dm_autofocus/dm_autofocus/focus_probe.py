@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dm_autofocus.images import SettledGate, grey, raw_image
+from dm_autofocus.images import STAMP_AHEAD, STAMP_AHEAD_SIMULATED, SettledGate, grey, raw_image
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
@@ -199,7 +199,9 @@ class FocusProbe:
         """
         self._wait(lambda: True, 0.0, self._check)  # an action that is to stop must not request another shape
         with self._changed:
-            self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
+            simulated = self._node.get_clock().ros_time_is_active
+            ahead = STAMP_AHEAD_SIMULATED if simulated else STAMP_AHEAD
+            self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"], ahead)
             self.answer, self._degauss_s = None, 0.0
             self.target = curvature
             self._asked.append(curvature)

@@ -56,8 +56,9 @@ ENCODINGS: dict[str, _Layout] = {
 }
 #: Share of pixels with the largest value from which on the exposure counts as faulty.
 CLIPPED = 0.2
-#: Longest time by which a stamp may be ahead of the clock on arrival [s]: a simulated clock only ticks now and then.
-STAMP_AHEAD = 0.5
+#: Longest time by which an exposure may seem to begin after its image has arrived [s], as clocks agree only roughly;
+#: and with a simulated clock, which only ticks now and then.
+STAMP_AHEAD, STAMP_AHEAD_SIMULATED = 0.05, 0.5
 
 
 #: Encodings by the modes to which Pillow decodes images, "I" for 16 bits before its version 10.3; images of other modes
@@ -175,14 +176,16 @@ class SettledGate:
     Args:
         settle_time: wait after the last write to the electronics [s].
         stamp_lead: by how much the exposure began before the image's stamp [s]; 0 = stamps mark its beginning.
+        ahead: longest time by which an exposure may seem to begin after its image has arrived [s].
 
     Attributes:
         settled_at: when the shape of the last move has settled; inf = not known yet.
     """
 
-    def __init__(self, settle_time: float, stamp_lead: float = 0.0) -> None:
+    def __init__(self, settle_time: float, stamp_lead: float = 0.0, ahead: float = STAMP_AHEAD) -> None:
         self._settle_time = settle_time
         self._stamp_lead = stamp_lead
+        self._ahead = ahead
         self._sent_at = math.inf
         self._stands_at = math.inf
         self.settled_at = math.inf
@@ -205,7 +208,7 @@ class SettledGate:
 
     def open_for(self, stamp: float, now: float = math.inf) -> bool:
         """Whether an image with this stamp, which has arrived at `now`, was exposed after the shape had settled."""
-        return stamp - self._stamp_lead >= self.settled_at and stamp <= now + STAMP_AHEAD
+        return self.settled_at <= stamp - self._stamp_lead <= now + self._ahead
 
     def reason(self, newest: float | None, apart: float, timeout_s: float, now: float = math.inf) -> str:
         """Why no image has counted within a time.
@@ -216,8 +219,9 @@ class SettledGate:
             timeout_s: how long was waited for an image.
             now: present time.
         """
-        if newest is not None and newest > now + STAMP_AHEAD:
-            return f"the newest is stamped {newest - now:.3f} s ahead of the time here; do the clocks agree?"
+        if newest is not None and newest - self._stamp_lead > now + self._ahead:
+            ahead = newest - self._stamp_lead - now
+            return f"the newest is stamped {ahead:.3f} s ahead of the time here; do the clocks agree?"
         if 2 * apart > timeout_s:  # one period may pass until an exposure begins, and another until it has arrived
             return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
         if newest is None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from dm_autofocus.images import SettledGate
+from dm_autofocus.images import STAMP_AHEAD_SIMULATED, SettledGate
 
 SETTLE, MOVE = 0.004, 0.03
 
@@ -73,11 +73,16 @@ def test_images_without_a_stamp_never_count() -> None:
 
 def test_images_stamped_ahead_of_the_time_never_count() -> None:
     """They would count though they were exposed before the move; a simulated clock may lag a little."""
-    gate = SettledGate(SETTLE)
-    gate.sent(100.0, MOVE)
-    gate.written(100.0 + MOVE, moving=False, reached=True)
-    assert gate.open_for(100.4, now=100.2) and not gate.open_for(103.0, now=100.2)
-    assert "stamped 2.800 s ahead of the time here" in gate.reason(103.0, 3.0, 2.0, now=100.2)
+    gate, simulated = SettledGate(SETTLE), SettledGate(SETTLE, ahead=STAMP_AHEAD_SIMULATED)
+    corrected = SettledGate(SETTLE, stamp_lead=0.2)
+    for one in (gate, simulated, corrected):
+        one.sent(100.0, MOVE)
+        one.written(100.0 + MOVE, moving=False, reached=True)
+    assert simulated.open_for(100.4, now=100.2) and not gate.open_for(100.4, now=100.2)
+    assert corrected.open_for(100.4, now=100.2), "stamp_lead tells by how much that clock is ahead"
+    assert gate.open_for(100.21, now=100.2)
+    assert "stamped 0.200 s ahead of the time here" in gate.reason(100.4, 0.03, 2.0, now=100.2)
+    assert "stamped 2.800 s ahead of the time here" in simulated.reason(103.0, 3.0, 2.0, now=100.2)
 
 
 def test_a_camera_that_stopped_is_not_told_to_set_its_clock() -> None:
