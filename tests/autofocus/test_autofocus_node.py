@@ -401,6 +401,15 @@ def test_a_recorded_search_shows_the_same_sharpness_again(
     assert played.states[-1].dioptre == pytest.approx(2 * played.states[-1].curvature), "by other optics"
 
 
+def test_two_cameras_on_one_topic_are_told(scene: FilmedScene, observer: Observer) -> None:
+    """Images of both count; the focus that is found is then of neither."""
+    scene.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+    health = observer.record(DiagnosticArray, "/diagnostics", 10)
+    told = "2 nodes publish on /image_raw, and images of all count"
+    wait_until(lambda: any(told in item.status[0].message for item in health), 20, "it in the node's health")
+    assert told in observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result.message
+
+
 def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer) -> None:
     scene.stamped = False
     wait_until(lambda: scene.states[-1].header.stamp.sec == 0, what="an image without a stamp")

@@ -152,8 +152,8 @@ class AutofocusNode(ManagedNode):
             elif time.monotonic() - since > limit:
                 text = f"no image on {self._probe.topic} within image_timeout = {limit:g} s: is the camera running?"
                 raise Refusal(ErrorCode.TIMEOUT, text)
-            if self._image_problem:
-                raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
+            if problem := self._probe.doubled() or self._image_problem:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, problem)
         except Refusal as error:
             return Health(WARN, str(error), values)
         return Health(OK, self._probe.user or "ready", values)

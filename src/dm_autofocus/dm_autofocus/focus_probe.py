@@ -265,6 +265,11 @@ class FocusProbe:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
         return SharpnessSample(sharpness, image, (part,))
 
+    def doubled(self) -> str:
+        """That several cameras send to this node, as a sentence; "" = they do not."""
+        count = self._node.count_publishers(self.topic)
+        return f"{count} nodes publish on {self.topic}, and images of all count: one camera only" if count > 1 else ""
+
     def await_capabilities(self, timeout_s: float, check: Callable[[], None]) -> None:
         """Wait for the first capabilities, at most `timeout_s`. Raises what `check` raises meanwhile."""
         self._wait(lambda: self.capabilities is not None, timeout_s, check)
