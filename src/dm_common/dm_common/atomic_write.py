@@ -26,9 +26,12 @@ def storing(failure: str) -> Iterator[None]:
 def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to a temporary file and rename that to `path` in one step; the folder is created if needed.
 
+    A link at `path` stays: what it leads to is replaced.
+
     Raises:
         OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
     """
+    path = Path(os.path.realpath(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from dm_common.atomic_write import write_whole
 from dm_common.state_files import ros_home, state_file
 
 
@@ -37,3 +38,12 @@ def test_names_that_look_alike_as_files_are_told_apart() -> None:
 
 def test_no_folder_is_no_file() -> None:
     assert state_file("", ".shape", "a") is None
+
+
+def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None:
+    file, link = tmp_path / "share" / "figures.json", tmp_path / "figures.json"
+    link.symlink_to(file)
+    for content in (b"first", b"second"):
+        write_whole(link, content)
+        assert link.is_symlink() and file.read_bytes() == content
+    assert sorted(tmp_path.rglob("*")) == [link, file.parent, file]

@@ -88,7 +88,7 @@ def write_parameters(
     camera = CAMERA if source == shared_config("bench.yaml") and "autofocus" in nodes else {}
     text = edited(edited(source.read_text(), camera), values_of(parameters), namespace)
     keep_before(target)
-    write_whole(target.resolve(), text.encode())
+    write_whole(target, text.encode())
     console.print(f"{target} is written from {source}: start the nodes with it, then check again")
 
 
