@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,8 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from dm_msgs.action import Degauss
-from dm_msgs.srv import SetSignals
+from dm_msgs.srv import Measure, SetSignals
 from rclpy.node import Node
+from rclpy.time import Time
 
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.ros import bench_services
@@ -70,6 +72,29 @@ def test_a_map_that_the_end_of_the_process_cuts_off_has_not_failed() -> None:
     server: Any = SimpleNamespace(wait_for_return=lambda _stop: None, since_now=lambda _ready: lambda: "")
     with pytest.raises(Cancelled), bench._answered("measure", server, lambda: True):
         raise ServiceCallError("measure: cancelled")
+
+
+@pytest.mark.parametrize(("simulated", "step_s"), [(False, 3600.0), (False, -3600.0), (True, -3600.0)])
+def test_a_map_takes_as_long_when_the_clock_is_set_meanwhile(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch, simulated: bool, step_s: float
+) -> None:
+    """The next run holds the mirror for as many times that: a negative duration would be refused."""
+    shifts, node = [0.0], observer.node
+
+    def answer(_request: Any, response: Any) -> Any:
+        shifts.append(step_s)
+        samples = response.samples
+        samples.sag = samples.x = samples.y = samples.weight = [1.0]
+        return response
+
+    def now() -> Time:
+        return Time(seconds=1e9 + time.monotonic() + shifts[-1])
+
+    node.create_service(Measure, "measure", answer)
+    bench = BenchServices(node, {"settle_time": 0.0, "measure_timeout": 60.0})
+    monkeypatch.setattr(node, "get_clock", lambda: SimpleNamespace(now=now, ros_time_is_active=simulated))
+    bench.measure_as_it_stands("rest")
+    assert shifts[-1] == step_s and 0.0 <= bench.map_time < 60.0
 
 
 def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: Observer) -> None:

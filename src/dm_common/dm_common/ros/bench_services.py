@@ -24,7 +24,7 @@ from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call, run_goal
-from dm_common.ros.worker import sleep
+from dm_common.ros.worker import lasting, sleep
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
@@ -184,7 +184,8 @@ class BenchServices:
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
-        began = self._node.get_clock().now()
+        clock = lasting(self._node.get_clock())
+        began = clock.now()
         # The interferometer enforces the time limit; the call waits a little longer for its answer with the reason.
         try:
             with self._answered("measure", self._interferometer, self._measure.service_is_ready) as stop:
@@ -194,7 +195,7 @@ class BenchServices:
             if error.error_code in _FATAL or self.hold.lost is not None:
                 raise
             raise MeasurementError(error.error_code, str(error)) from error
-        self.map_time = (self._node.get_clock().now() - began).nanoseconds * 1e-9
+        self.map_time = max(0.0, (clock.now() - began).nanoseconds * 1e-9)  # a simulation may begin anew
         check()
         try:
             # The state was read after the map, so its stamp is that of the write that the map shows.

@@ -271,6 +271,11 @@ def wait_for_clock(clock: Clock) -> None:
         time.sleep(0.01)
 
 
+def lasting(clock: Clock) -> Clock:
+    """The clock that durations are taken by: `clock` if it is simulated, else a steady one: system time may be set."""
+    return clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)
+
+
 def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
     """Sleep in a worker thread; in ROS time if that is simulated: it may then run fast, or restart.
 
@@ -278,7 +283,7 @@ def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: 
     has ended) for 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
-    ticking = clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)  # system time may be set
+    ticking = lasting(clock)
     end = ticking.now() + (whole := Duration(nanoseconds=round(seconds * 1e9)))
     give_up = time.monotonic() + 10.0 + 10.0 * seconds
     while (remaining := (end - ticking.now()).nanoseconds * 1e-9) > 0:
