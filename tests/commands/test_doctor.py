@@ -350,6 +350,20 @@ def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.close(leader)
 
 
+def test_the_usual_folder_of_calibrations_is_looked_at_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a file without a section for the node `calibration`, which runs all the same."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    damaged = tmp_path / ".ros" / "dm_calibrations" / "damaged.h5"
+    damaged.parent.mkdir(parents=True)
+    damaged.touch()
+    config = {node: values for node, values in bench({}).items() if node != "calibration"}
+    save_config(config, tmp_path / "bench.yaml")
+    found = dict(doctor_bench.bench_checks(tmp_path / "bench.yaml"))
+    assert f"calibration folder {damaged.parent}" in found
+    finding = found["calibration"]()
+    assert finding is not None and finding.problem.startswith(damaged.name)
+
+
 def test_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "file"
     file.touch()
@@ -382,7 +396,9 @@ def test_nodes_that_begin_with_other_creep_are_told() -> None:
     finding = doctor_bench.one_record(folders)
     assert finding and "'/srv/creep', calibration: '~/.ros/focus_controller'" in finding.problem
     assert doctor_bench.one_record(folders | {"calibration": {"state_folder": "/srv/creep"}}) is None
-    assert doctor_bench.one_record({"focus_controller": {"state_folder": ""}}) is None
+    finding = doctor_bench.one_record({"focus_controller": {"state_folder": ""}})  # calibration runs all the same
+    assert finding and finding.problem.startswith("state_folder differs (focus_controller: ''")
+    assert doctor_bench.one_record({}) is None
 
 
 def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

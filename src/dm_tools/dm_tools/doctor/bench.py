@@ -63,8 +63,8 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
         watched = Path(interferometer["watch_folder"]).expanduser()
         writes = "{path}" in " ".join(interferometer["trigger_command"])
         yield f"watched folder {watched}", lambda: watched_folder(watched, writes, made)
-    if config.get("calibration", {}).get("calibration_folder"):
-        calibration = effective("calibration", config["calibration"])
+    calibration = effective("calibration", config.get("calibration", {}))
+    if calibration["calibration_folder"]:
         store = Path(calibration["calibration_folder"]).expanduser()
         yield f"calibration folder {store}", lambda: writable_folder(store)
         if (serial := driver["mirror.serial"]) not in ("", REQUIRED):
@@ -148,8 +148,8 @@ def aperture_fits(config: Config) -> Finding | None:
 
 def one_record(config: Config) -> Finding | None:
     """Whether both nodes that follow the actuators begin with the same record of what these have crept to."""
-    nodes = [node for node in ("focus_controller", "calibration") if node in config]
-    folders = {node: effective(node, config[node])["state_folder"] for node in nodes}
+    nodes = ("focus_controller", "calibration")
+    folders = {node: effective(node, config.get(node, {}))["state_folder"] for node in nodes}
     if len(set(folders.values())) < 2:
         return None
     told = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
