@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,6 +55,18 @@ def test_segments_go_after_their_process_was_killed(domain: int) -> None:
         assert all(segment.exists() for segment in segments)
         remove_orphaned_segments(0.0)
         assert not any(segment.exists() or segment.with_name(f"{segment.name}_el").exists() for segment in segments)
+
+
+def test_segments_from_before_the_clock_was_set_back_go_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_memory, "SHARED_MEMORY", tmp_path)
+    left = [tmp_path / "fastrtps_0123456789abcdef_el", tmp_path / "fastrtps_0123456789abcdef"]
+    for file in left:
+        file.touch()
+    remove_orphaned_segments()  # may be of a process that has not locked them yet
+    assert all(file.exists() for file in left)
+    os.utime(left[0], (time.time() + 3600.0,) * 2)
+    remove_orphaned_segments()
+    assert not any(file.exists() for file in left)
 
 
 @pytest.mark.parametrize(

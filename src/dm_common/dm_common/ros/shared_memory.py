@@ -45,7 +45,7 @@ def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
             continue
         # Segments that are locked, owned by others, or just being removed by another node are left alone.
         with suppress(OSError), lock.open("r+b") as handle:
-            if time.time() - lock.stat().st_mtime >= least_age_s:
+            if abs(time.time() - lock.stat().st_mtime) >= least_age_s:  # the clock may have been set back
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 lock.with_name(lock.name.removesuffix("_el")).unlink(missing_ok=True)
                 lock.unlink()
