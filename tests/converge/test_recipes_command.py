@@ -17,6 +17,7 @@ from dm_tools.verbs.recipes import curvatures_of, next_of
 
 def test_a_list_or_a_range() -> None:
     assert curvatures_of("-0.02, 0,0.02") == [-0.02, 0.0, 0.02]
+    assert curvatures_of("−0.02,0,0.02") == [-0.02, 0.0, 0.02]
     assert curvatures_of("-0.05:0.05:11") == pytest.approx([-0.05 + 0.01 * k for k in range(11)])
     assert 0.0 in curvatures_of("-0.05:0.05:11")
     assert curvatures_of("-0,05:0,05:11") == curvatures_of("-0.05:0.05:11")
@@ -37,7 +38,7 @@ def test_progress_names_the_shape_being_worked_on() -> None:
 
 
 def test_added_terms_go_by_the_names_that_measure_prints() -> None:
-    terms = dict(zip(SPOKEN, terms_of("astigmatism cos=200, coma sin=-50"), strict=True))
+    terms = dict(zip(SPOKEN, terms_of("astigmatism cos=200, coma sin=−50"), strict=True))
     assert {name: value for name, value in terms.items() if value} == pytest.approx(
         {"astigmatism cos": 2e-7, "coma sin": -5e-8}
     )

@@ -132,6 +132,8 @@ def terms_of(text: str) -> list[float]:
     Raises:
         ValueError: an unknown or repeated term, or a value that is not a number; the message names it.
     """
+    from dm_common.figures import with_point  # only commands ask
+
     terms: dict[str, float] = {}
     for part in text.split(","):
         name, _, value = (each.strip() for each in part.partition("="))
@@ -140,7 +142,7 @@ def terms_of(text: str) -> list[float]:
         if name not in SPOKEN:
             raise ValueError(f"zernike = {text!r}: must be like 'coma sin=-50'; terms: {', '.join(SPOKEN)}")
         try:
-            terms[name] = 1e-9 * float(value)
+            terms[name] = 1e-9 * float(with_point(value))
         except ValueError as error:
             raise ValueError(f"zernike = {text!r}: {value!r} is not a number of nm") from error
     return [terms.get(name, 0.0) for name in SPOKEN]

@@ -27,7 +27,7 @@ def curvatures_of(text: str) -> list[float]:
     parts = (with_point(text) if ":" in text else text).split(":")
     try:
         if len(parts) == 1:
-            listed = [float(part) for part in text.split(",") if part.strip()]
+            listed = [float(with_point(part)) for part in text.split(",") if part.strip()]
             if not listed or not all(map(math.isfinite, listed)) or max(map(abs, listed)) >= 1.0:  # such as 0,02
                 raise ValueError
             return listed
