@@ -26,11 +26,14 @@ def storing(failure: str) -> Iterator[None]:
 def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to a temporary file and rename that to `path` in one step; the folder is created if needed.
 
-    A link at `path` stays: what it leads to is replaced.
+    A link at `path` stays: what it leads to is replaced. A device or a pipe is written to, and not replaced by a file.
 
     Raises:
         OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
     """
+    if path.exists() and not path.is_file():
+        path.write_bytes(content)
+        return
     path = Path(os.path.realpath(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

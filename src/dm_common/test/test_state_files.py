@@ -1,5 +1,6 @@
 """Where nodes keep their state."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -47,3 +48,12 @@ def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None
         write_whole(link, content)
         assert link.is_symlink() and file.read_bytes() == content
     assert sorted(tmp_path.rglob("*")) == [link, file.parent, file]
+
+
+def test_a_pipe_is_written_to_and_not_replaced_by_a_file(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_whole(pipe, b"figures")
+    assert pipe.is_fifo() and os.read(reader, 100) == b"figures"
+    os.close(reader)

@@ -156,8 +156,7 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    # A device or a pipe must not be replaced by a file.
-    if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
+    if path.is_relative_to("/dev"):  # may be a file that somebody has open
         path.write_text(text)
     else:
         write_whole(path, text.encode())

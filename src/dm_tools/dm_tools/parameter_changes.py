@@ -60,7 +60,7 @@ def source_of(target: Path, config: Path | None, serial: str, namespace: str = "
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
     """
-    source = config or (target if target.exists() else shared_config("bench.yaml"))
+    source = config or (target if target.is_file() else shared_config("bench.yaml"))
     written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
         raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
@@ -94,7 +94,7 @@ def write_parameters(
 
 def keep_before(target: Path) -> None:
     """Copy an existing file at `target` beside it under a free name. Raises OSError."""
-    if target.exists():
+    if target.is_file():
         kept = (target.with_name(f"{target.name}.before{number}") for number in chain([""], count(2)))
         before = next(path for path in kept if not path.exists())
         write_whole(before, target.read_bytes())
