@@ -118,12 +118,10 @@ def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_
     # The bench cannot turn its mirror: a table that turns nothing is refused, one that says it was turned is believed.
     table, target = tmp_path / "flats.csv", tmp_path / "flat.fits"
     table.write_text("\n".join(rows))
-    refused = CliRunner().invoke(make_app(), ["instrument", "flats", str(table), "--write", str(target)])
-    assert refused.exit_code == 2 and "tell no flat from another" in " ".join(refused.output.split())
+    assert "tell no flat from another" in refused("flats", table, "--write", target)
     table.write_text("\n".join([*rows[:2], rows[2] + "77"]))
     for read in (table, rows[1].partition(",")[0]):
-        refused = CliRunner().invoke(make_app(), ["instrument", "flats", str(table), "--write", str(read)])
-        assert refused.exit_code == 2 and "is read for this" in " ".join(refused.output.split())
+        assert "is read for this" in refused("flats", table, "--write", read)
     target.write_text("of before")
     assert run("flats", table, "--write", target)["reference_surface"] == str(target)
     assert (tmp_path / "flat.fits.before").read_text() == "of before"
@@ -148,8 +146,8 @@ def test_tables_with_gaps_and_files_too_many_are_refused(tmp_path: Path) -> None
         with pytest.raises(ValueError, match=r"map\.dat: must be a table"):
             _table(tmp_path / "map.dat", "column")
     for files in ((table, table, "--write", tmp_path / "flat.fits"), (table,)):
-        refused = CliRunner().invoke(make_app(), ["instrument", "flats" if files[1:] else "grid", *map(str, files)])
-        assert refused.exit_code == 2 and f"{len(files[:2])} files: must be" in " ".join(refused.output.split())
+        wrong = CliRunner().invoke(make_app(), ["instrument", "flats" if files[1:] else "grid", *map(str, files)])
+        assert wrong.exit_code == 2 and f"{len(files[:2])} files: must be" in " ".join(wrong.output.split())
 
 
 def test_numbers_that_are_found_are_numbers_in_a_parameter_file(
@@ -182,9 +180,10 @@ def save(path: Path, sag: NDArray[np.float64], **others: Any) -> Path:
 
 
 def refused(*words: object) -> str:
+    """What is said of files that do not serve: the usage is right, so the exit status is not 2."""
     done = CliRunner().invoke(make_app(), ["instrument", *map(str, words)])
-    assert done.exit_code == 2
-    return " ".join(done.output.replace("│", " ").split())
+    assert done.exit_code == 1
+    return str(done.exception)
 
 
 @pytest.mark.parametrize(

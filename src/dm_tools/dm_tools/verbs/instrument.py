@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.atomic_write import write_whole
-from dm_common.errors import CodedError
 from dm_common.optics.zernike import MAX_ORDER
 from dm_tools.output import JsonOption, console, next_step, output_file, write_json
 from dm_tools.parameter_changes import keep_before
@@ -66,15 +65,12 @@ def instrument(
     wanted = {Procedure.FLATS: (1, "one table of maps"), Procedure.GRID: (2, "the table of marks and one map")}
     if procedure in wanted and len(files) != wanted[procedure][0]:
         raise typer.BadParameter(f"{len(files)} files: must be {wanted[procedure][1]}")
-    try:
-        if write is not None:
-            found = _flats(files[0], write, read)
-        elif procedure is Procedure.RETRACE:
-            found = _retrace([read(file).sag for file in files])
-        else:
-            found = _grid(files[0], read(files[1]))
-    except (CodedError, ValueError, OSError) as error:
-        raise typer.BadParameter(str(error)) from error
+    if write is not None:
+        found = _flats(files[0], write, read)
+    elif procedure is Procedure.RETRACE:
+        found = _retrace([read(file).sag for file in files])
+    else:
+        found = _grid(files[0], read(files[1]))
     console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
     write_json(json, {"instrument": found})
     next_step("put the parameters into the parameter file; `instrument_error` is the bound on what is left")

@@ -60,10 +60,7 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
     """Print the lateral resolution (m per pixel) that a map of a known sphere gives, as parameters, and its limits."""
     from dm_calibration.influence.poke_cure import parameter_text
 
-    try:
-        pitch, share = pitch_of_sphere(coefficients, info.aperture_radius_px, info.pitch, radius_of_curvature)
-    except ValueError as error:
-        raise typer.BadParameter(f"--reference-sphere: {error}") from error
+    pitch, share = pitch_of_sphere(coefficients, info.aperture_radius_px, info.pitch, radius_of_curvature)
     differs = f", {pitch / info.pitch - 1.0:+.3%} against what is in use" if info.pitch > 0.0 else ""
     console.print(
         f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it. "
