@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -491,8 +492,8 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
 
 def test_of_another_bench_the_wiring_comes_first() -> None:
     """As docs/my-own-bench.md has it: four minutes of calibration on wrong wiring are lost."""
-    none, able, file = Capabilities(), Capabilities(calibration_id="c1"), Path("my_bench.yaml")
-    check = parsed("calibrate", *first_command(none, file).split()[1:])
+    none, able, file = Capabilities(), Capabilities(calibration_id="c1"), Path("my bench.yaml")
+    check = parsed("calibrate", *shlex.split(first_command(none, file))[1:])
     assert check["plan"] == "poke-check" and check["config"] == file and check["write"] is not None
     assert first_command(able, file) == "focus 0.02" and first_command(none, None) == "calibrate"
     # As ./dm status has it then.

@@ -1,6 +1,7 @@
 """`dm doctor`: what is wrong on this machine or bench, in words, and how to cure it."""
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
@@ -45,7 +46,7 @@ def doctor(
         next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again", namespace)
         raise typer.Exit(1)
     running = findings["nodes that are running"]
-    start = f"./dm up{f' --config {config}' if config else ''}"
+    start = f"./dm up{f' --config {quote(str(config))}' if config else ''}"
     next_step("./dm status" if running and not running.cure else start, namespace)
 
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -186,7 +187,9 @@ def first_command(capabilities: Any, file: Path | None) -> str:
         return "degauss" if unknown_history(capabilities) else "focus 0.02"
     if calibration_refused(capabilities):
         return "calibrate"
-    return f"calibrate --plan poke-check --config {file} --write found.yaml" if file is not None else "calibrate"
+    if file is None:
+        return "calibrate"
+    return f"calibrate --plan poke-check --config {quote(str(file))} --write found.yaml"
 
 
 def configurations(files: list[Path], namespaces: list[str], camera: bool = False) -> dict[str, Config]:
