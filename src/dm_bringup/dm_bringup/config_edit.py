@@ -49,7 +49,7 @@ def _with_value(text: str, key: str, name: str, value: Any) -> str:
         return f"{text.rstrip()}\n\n{key}:\n  ros__parameters:\n    {name}: {literal}\n"
     for parameter, old in section.value:
         if parameter.value == name:
-            start, end = old.start_mark, old.end_mark.index
+            start, end = old.start_mark, len(text[: old.end_mark.index].rstrip())  # a block of text ends a line below
             if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # keep one item per line
                 end = old.value[-1].end_mark.index
                 literal = f"\n{' ' * start.column}".join(f"- {_literal(item)}" for item in value)

@@ -59,6 +59,7 @@ def test_new_parameters_come_first_in_the_order_in_which_they_are_told(text: str
         "/**/pdm_driver: {ros__parameters: {mirror.serial: a, mirror.channels: [1,\n 2]}}\n",
         "pdm_driver:\n  ros__parameters:\n    mirror.channels:  # as wired\n    - 1\n    - 2\n    # that is all\n"
         "    mirror.serial: a\n",
+        "pdm_driver:\n  ros__parameters:\n    mirror.wiring: >-\n      trihex\n    mirror.serial: a\n",
     ],
 )
 def test_files_of_other_forms(text: str) -> None:
