@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from dm_msgs.srv import HoldMirror
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import clients
+from dm_driver.commands.command_gate import CommandGate
 from dm_driver.commands.mirror_hold import LEASE_S, MirrorHold, Operation
 
 
@@ -237,3 +240,21 @@ def test_a_run_takes_over_what_somebody_else_holds_only_where_it_is_asked_to(
         assert run.holder == hold.holder == "loop"
         with refused(ErrorCode.PREEMPTED):
             hold.ask(Operation.RENEW, "calibration")
+
+
+def test_nobody_is_granted_the_mirror_while_a_command_of_another_is_on_its_way() -> None:
+    """It would lose the mirror to that command at once, and its run with it."""
+    hold = MirrorHold(time.monotonic)
+    gate = CommandGate(hold, lambda _text, _took_over: None)
+    gate.writer = gate.configuration = cast(Any, object())
+    asking = threading.Thread(target=hold.ask, args=(Operation.HOLD, "calibration"))
+
+    def carry_out(_writer: Any, _configuration: Any) -> str:
+        asking.start()
+        asking.join(0.1)
+        return "moves"
+
+    assert gate.attempt("set_signals", SimpleNamespace(holder="", take_over=False), carry_out) == "moves"
+    asking.join()
+    hold.ask(Operation.RENEW, "calibration")
+    assert hold.holder == "calibration"

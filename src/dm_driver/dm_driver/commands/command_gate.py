@@ -66,14 +66,14 @@ class CommandGate:
                 reason = self.trouble or "configure and activate it first"
                 raise Refusal(ErrorCode.DRIVER_INACTIVE, f"the driver is not configured: {reason}")
             TEXT.check("holder", request.holder)
-            takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
-            result = carry_out(writer, configuration)
-            if result is not None:
-                holder = self.hold.holder
-                self.hold.evict(request.holder, request.take_over)
-                if takes_over:
-                    by = request.holder or "nobody in particular"
-                    self._report(f"{source} of {by} took the mirror from {holder}", True)
+            with self.hold.lock:  # else somebody might be granted the mirror in between, and lose it to this command
+                takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
+                result, holder = carry_out(writer, configuration), self.hold.holder
+                if result is not None:
+                    self.hold.evict(request.holder, request.take_over)
+            if takes_over and result is not None:
+                by = request.holder or "nobody in particular"
+                self._report(f"{source} of {by} took the mirror from {holder}", True)
             return result
         except Refusal as refusal:
             if not dry_run:

@@ -30,11 +30,11 @@ TEXT = text("")
 
 
 class MirrorHold:
-    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s."""
+    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s; `lock` keeps it as it is."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         # After its lease has run out, the holder is kept until somebody else moves the mirror: see `holder`.
         self._holder = self._purpose = ""
         self._since = self._until = self._duration = self._lease = 0.0
@@ -43,13 +43,13 @@ class MirrorHold:
     @property
     def holder(self) -> str:
         """Who holds the mirror; "" = nobody."""
-        with self._lock:
+        with self.lock:
             return self._holder if self._clock() <= self._until else ""
 
     @property
     def sentence(self) -> str:
         """Who holds the mirror, since when and what for; "" = nobody does."""
-        with self._lock:
+        with self.lock:
             if not self.holder:
                 return ""
             held = self._clock() - self._since
@@ -70,7 +70,7 @@ class MirrorHold:
         TEXT.check("purpose", purpose)
         _DURATION.check("duration", duration)
         _LEASE.check("lease", lease)
-        with self._lock:
+        with self.lock:
             current = self.holder
             if operation == Operation.RENEW:
                 self._check_evicted(holder)
@@ -99,7 +99,7 @@ class MirrorHold:
         Raises:
             Refusal: BUSY, somebody else holds the mirror; PREEMPTED, `holder` lost it and has not held it again.
         """
-        with self._lock:
+        with self.lock:
             if not take_over:
                 self._check_evicted(holder)
             other = self.holder not in ("", holder)
@@ -112,7 +112,7 @@ class MirrorHold:
 
         So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must report it.
         """
-        with self._lock:
+        with self.lock:
             if take_over:  # it has taken the mirror back
                 self._evicted.pop(by, None)
             self._evict(by, by or ("a command with take_over" if self.holder else "a command"))
