@@ -154,8 +154,8 @@ def test_two_pages_show_the_same_and_either_dismisses(page: Browser, bench: tupl
 
 def test_a_calibration_started_elsewhere_is_shown_and_can_be_cancelled(page: Browser, bench: tuple[int, str]) -> None:
     with Observer(bench[0]) as observer:
-        # Long enough that it still runs when a slow browser comes to cancel it.
-        goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, maps_per_state=20)
+        # Two seconds a map: it still runs when a slow browser comes to cancel it, and leaves the browser time to.
+        goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, settle_time=40.0)
         _, result = observer.send_goal(Calibrate, "calibrate", goal)
         page.wait_for("A calibration that was started elsewhere", 30)
         page.wait_for("Step ", 30)
