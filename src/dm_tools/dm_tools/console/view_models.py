@@ -18,7 +18,7 @@ from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 SIGMAS_95 = 1.96
 #: Largest number of recipes in one run.
 NUMBER_MAX = 1000
-SIGNAL_COLOURS = "cividis"
+SIGNAL_COLOURS = colormaps["cividis"]  # taken once: each time Matplotlib makes a copy, whose table it computes anew
 QUALITIES = {
     Capabilities.UNCALIBRATED: "uncalibrated",
     Capabilities.APPROXIMATE: "approximate",
@@ -87,7 +87,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
         fill = "#e4e7eb"
         if signal is not None:
             share = (signal - mirror.signal_min) / (mirror.signal_max - mirror.signal_min)
-            fill = to_hex(colormaps[SIGNAL_COLOURS](share))
+            fill = to_hex(SIGNAL_COLOURS(share))
         marks = _marks(flag, grade, signal, mirror)
         found.append(
             Cell(

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from scipy.spatial import HalfspaceIntersection
 
@@ -19,7 +18,7 @@ ALONE = 2.0
 #: Free space below the map for the scale of the signals, px; style.py adds the same to the height.
 SCALE = 44
 #: Colours of that scale, low to high; the browser blends them.
-SHADES = [to_hex(colour) for colour in colormaps[SIGNAL_COLOURS](np.linspace(0.0, 1.0, 33))]
+SHADES = [to_hex(colour) for colour in SIGNAL_COLOURS(np.linspace(0.0, 1.0, 33))]
 #: Points of the circle of the aperture.
 CIRCLE = 91
 #: JavaScript that draws an actuator's cell: its outline, and its number and signal as large as they fit.

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.colors import Colormap, to_hex
 from matplotlib.image import imsave
 
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION
@@ -78,7 +78,8 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
     reach, length = (surface.radius * 1e3, "mm") if surface.radius > 0 else (1.0, "aperture radii")
     high = limit * factor
     share = np.linspace(0.0, 1.0, 33)
-    stops = [{"offset": k, "color": to_hex(colormaps[colours](1.0 - k))} for k in share.tolist()]
+    palette = colormaps[colours]
+    stops = [{"offset": k, "color": to_hex(palette(1.0 - k))} for k in share.tolist()]
     shades = {"type": "linear", "x": 0, "y": 0, "x2": 0, "y2": 1, "colorStops": stops}
     # No labels at the ends of the axes, which are not round numbers.
     plain = {"splitLine": {"show": False}, "axisLabel": {"color": INK, "showMinLabel": False, "showMaxLabel": False}}
@@ -103,15 +104,15 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
                 "type": "custom",
                 "silent": True,
                 "data": [[-reach, reach, reach, -reach]],
-                ":renderItem": DRAW % _image(surface.sag / limit, colours),
+                ":renderItem": DRAW % _image(surface.sag / limit, palette),
             }
         ],
     )
 
 
-def _image(values: Floats, colours: str) -> str:
+def _image(values: Floats, palette: Colormap) -> str:
     """The values -1 .. +1 in colours, as the data URL of a PNG picture; NaN is transparent."""
-    rgba = colormaps[colours](np.clip(0.5 + 0.5 * np.nan_to_num(values), 0.0, 1.0), bytes=True)
+    rgba = palette(np.clip(0.5 + 0.5 * np.nan_to_num(values), 0.0, 1.0), bytes=True)
     rgba[..., 3] = np.where(np.isfinite(values), 255, 0)
     buffer = io.BytesIO()
     imsave(buffer, rgba, format="png")
