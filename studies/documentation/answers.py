@@ -198,7 +198,7 @@ def run() -> Iterator[Answer]:
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
         folder = Path(temporary)
         config = bench_config(folder, "off", 0.0, 3, 5.0)
-        config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+        config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.05}
         config["virtual_bench"] |= {"camera.rate": 5.0, "camera.width": 64, "camera.height": 48}
         config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
         config["autofocus"] = {"optics.rest_distance": 10.0, "use_sim_time": True}
