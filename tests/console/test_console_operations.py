@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bench(folder: Path) -> Iterator[tuple[int, str]]:
     """ROS domain and address of the console of a bench of its own."""
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 5, 20.0)
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.05}
     config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     with own_domain() as domain, CommonLawsSuite(config, folder, domain) as suite, served(domain, folder) as address:
         yield domain, address
