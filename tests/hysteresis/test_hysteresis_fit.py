@@ -18,7 +18,7 @@ from dm_calibration.hysteresis.features import play_values
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run, run_of
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.screening import FitOptions
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
@@ -28,7 +28,7 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
 from dm_common.mirror import Applied
-from dm_common.optics.zernike import basis
+from dm_common.optics.zernike import PISTON_TILT, basis
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow
@@ -123,6 +123,18 @@ def test_maps_that_test_the_law_are_compared_with_each_other(monkeypatch: pytest
     run = Run(np.zeros((60, 1)), np.arange(60.0), Responses(np.zeros((60, 1)), 1, np.ones(60, dtype=bool)))
     kept = hysteresis_fit._without_outliers(run, test, ())[1].responses.usable
     assert np.flatnonzero(~kept).tolist() == [50]
+
+
+@pytest.mark.parametrize(("worse", "every", "factor"), [(2.0, 4, 2.0), (0.5, 4, 1.0), (2.0, 8, 1.0)])
+def test_held_moves_with_larger_errors_raise_the_promise(worse: float, every: int, factor: float) -> None:
+    """If there are four of them or more."""
+    maps, test = run(), np.array([kind == StepKind.CHECK for kind in run().kind])
+    held = test & (np.cumsum(test) % every == 0)
+    stamps = maps.stamp_ns[0] + round(20e9) * np.arange(len(maps))
+    maps = replace(maps, stamp_ns=stamps, moved_ns=stamps - np.where(held, round(10e9), round(0.7e9)))
+    error = np.where(test, np.where(held, worse, 1.0), np.nan)
+    found: Any = SimpleNamespace(held_out=error[:, None] * np.ones(maps.terms - PISTON_TILT))
+    assert hysteresis_fit._held(found, maps) == pytest.approx(factor)
 
 
 def test_a_map_that_contradicts_effective_signals_is_not_in_their_influence_function() -> None:

@@ -132,7 +132,7 @@ def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: A
     Raises ValueError if the focal length is not known.
     """
     focal_length = given_focal_length(values, camera_info)
-    if not focal_length > 0:
+    if not 0.0 < focal_length < math.inf:
         reason = "came not yet" if camera_info is None else "holds no fx"
         raise ValueError(f"optics.focal_length_px is 0, and camera_info {reason}")
     # Behind a relay that widens the beam m times, angles are m times smaller.

@@ -39,6 +39,7 @@ def test_the_last_moves_are_checks() -> None:
     assert commands.check.sum() == round(CHECK_SHARE * 200)
     assert commands.check[-int(commands.check.sum()) :].all()
     assert commands.degaussed == (160, 180)
+    assert (commands.dwell[commands.check] > 0.0).sum() == 5
 
 
 def test_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> None:

@@ -26,6 +26,8 @@ CREPT_MAX = 1.5
 #: actuator predict requests. With 53 beyond it, only 40 to 50 % of the requests to three mirrors were inside their
 #: bounds, and 90 % within 2.1 to 2.9 times the bound; so with fewer maps the bound is raised by a fourth power.
 MAPS_BEYOND, FEWER = 75, 4
+#: A test move counts as held if its map is older than HELD_AGE times the median; fewest held moves that count.
+HELD_AGE, HELD_MIN = 2.0, 4
 #: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
 
@@ -37,7 +39,8 @@ class HysteresisFit:
     Attributes:
         zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, from maps that had no part in
             the fit, with the noise of the maps subtracted; 0 for piston and tilt.
-        held_out_max_zernike: m, 95th percentile of the largest of these errors; more where the maps are few.
+        held_out_max_zernike: m, 95th percentile of the largest of these errors; more where the maps are few, or where
+            held moves have larger errors than the others.
         unknown_sigma: standard deviation of an effective signal when the history is not known.
         maps: number of maps from which the law was identified.
         remarks: sentences on how the law was chosen.
@@ -81,7 +84,7 @@ def fit_hysteresis(
         name=found.fit.candidate.name,
         law=law,
         zernike_sigma=sigma,
-        held_out_max_zernike=_largest_of(covariance) * _few_maps(found, run),
+        held_out_max_zernike=_largest_of(covariance) * _few_maps(found, run) * _held(found, maps),
         unknown_sigma=unknown_history_sigma(found.fit.law, *run.reach),
         maps=int(run.responses.usable.sum()),
         remarks=(*_remarks(found), *_left_out(maps, run), *_drifted(law)),
@@ -108,6 +111,20 @@ def _few_maps(found: Identification, run: Run) -> float:
     beyond = max(int(run.responses.usable.sum()) - run.signals.shape[1], 1)
     own = found.fit.candidate.own and found.fit.candidate.hysteretic
     return max(1.0, (MAPS_BEYOND / beyond) ** FEWER) if own else 1.0
+
+
+def _held(found: Identification, maps: MapSet) -> float:
+    """Factor by which the error of held test moves exceeds that of the others, at least 1.
+
+    Most requests are held for longer than a test move. Creep that the law does not describe, as of thermally activated
+    domain walls, shows in the held moves only.
+    """
+    error = np.square(found.held_out[:, : maps.terms - PISTON_TILT]).sum(axis=1)
+    seen, age = np.isfinite(error), 1e-9 * (maps.stamp_ns - maps.stamp_ns[0]) - maps.moved_s()
+    held = seen & (age > HELD_AGE * np.median(age[seen]))
+    if held.sum() < HELD_MIN or held.sum() == seen.sum():
+        return 1.0
+    return max(1.0, float(np.sqrt(error[held].mean() / error[seen & ~held].mean())))
 
 
 def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
