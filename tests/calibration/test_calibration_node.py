@@ -257,7 +257,11 @@ def test_failures_are_told_and_leave_things_as_they_were(
     result = run(pokes(), ErrorCode.MAP_TIMEOUT, "3 states in a row gave no map")
     assert len(result.dropped) == 3 and result.maps == 1
     bench.failing, bench.other_wavelength = set(), all_pokes
-    run(pokes(), ErrorCode.MAP_REJECTED, "wavelength 635.000 nm, before it was 632.800 nm (0 = not known): never mix")
+    run(
+        pokes(),
+        ErrorCode.MAP_REJECTED,
+        "wavelength 635.000 nm, in the maps before 632.800 nm (0 = not known): never mix",
+    )
     bench.other_wavelength, bench.other_aperture = set(), all_pokes
     run(pokes(), ErrorCode.MAP_REJECTED, "aperture radius 10.000 mm, the mirror's is 11.000 mm")
     bench.other_aperture = set()
@@ -284,7 +288,7 @@ def test_somebody_else_commands_meanwhile(node: NodeProcess, bench: StandIn, obs
     bench.disturbed_at = "poke+02"
     result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
     assert result.error_code == ErrorCode.PREEMPTED
-    assert "somebody else commanded the mirror" in result.message
+    assert "another program commanded the mirror" in result.message
     assert (bench.signals == 0.0).all()
 
 

@@ -256,7 +256,7 @@ def test_a_disk_that_fills_up_costs_one_map(tmp_path: Path, monkeypatch: pytest.
 
     write = os.pwrite
     monkeypatch.setattr("dm_calibration.procedure.run_journal.os.pwrite", full)
-    with pytest.raises(StoreError, match=r"map poke.*could not be kept in .*No space left"):
+    with pytest.raises(StoreError, match=r"map poke.*could not be stored in .*No space left"):
         procedure(run, POKES, lagging_bench()).run()
     run.journal.close()
     assert len(read_run(run.journal.folder).outcome.records) == len(run.outcome.records) >= 2

@@ -118,10 +118,10 @@ def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_
     # The bench cannot turn its mirror: a table that turns nothing is refused, one that says it was turned is believed.
     table, target = tmp_path / "flats.csv", tmp_path / "flat.fits"
     table.write_text("\n".join(rows))
-    assert "tell no flat from another" in refused("flats", table, "--write", target)
+    assert "do not distinguish the flats" in refused("flats", table, "--write", target)
     table.write_text("\n".join([*rows[:2], rows[2] + "77"]))
     for read in (table, rows[1].partition(",")[0]):
-        assert "is read for this" in refused("flats", table, "--write", read)
+        assert "is one of the files to read" in refused("flats", table, "--write", read)
     target.write_text("of before")
     assert run("flats", table, "--write", target)["reference_surface"] == str(target)
     assert (tmp_path / "flat.fits.before").read_text() == "of before"

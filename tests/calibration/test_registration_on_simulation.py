@@ -174,5 +174,5 @@ def test_a_third_of_the_pupil_is_no_map() -> None:
     # Without a lateral resolution, another aperture than the maps before.
     whole, part = np.zeros((260, 260)), replace(surface, pitch=None)
     before = Outcome(records=[Ingest(300).measure(replace(surface, sag=whole, pitch=None), IngestSettings())[1]])
-    with pytest.raises(MeasurementError, match=r"aperture of 44\.5 pixels radius, before it was 129\.5"):
+    with pytest.raises(MeasurementError, match=r"aperture radius 44\.5 pixels, in the maps before 129\.5"):
         check_comparable(Ingest(300).measure(part, IngestSettings())[1], before, RADIUS)

@@ -210,11 +210,14 @@ def test_start_fresh_is_for_one_goal(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"wavelength": 635e-9}, "wavelength 635.000 nm, before it was 632.800 nm"),
+        ({"wavelength": 635e-9}, "wavelength 635.000 nm, in the maps before 632.800 nm"),
         ({"radius": 10e-3}, "aperture radius 10.000 mm, the mirror's is 11.000 mm"),
-        ({"instrument": "Verifire, serial 2"}, "instrument 'Verifire, serial 2', before it was 'Verifire, serial 1'"),
-        ({"pitch": 30e-6}, "pixel pitch 30.000 um, before it was 25.000 um"),
-        ({"width": 1024}, "camera of 1024 x 944 pixels, before it was 944 x 944"),
+        (
+            {"instrument": "Verifire, serial 2"},
+            "instrument 'Verifire, serial 2', in the maps before 'Verifire, serial 1'",
+        ),
+        ({"pitch": 30e-6}, "pixel pitch 30.000 um, in the maps before 25.000 um"),
+        ({"width": 1024}, "camera of 1024 x 944 pixels, in the maps before 944 x 944"),
     ],
 )
 def test_maps_of_another_instrument_stop_the_run_which_goes_on_with_the_right_one(
@@ -246,7 +249,7 @@ def test_a_bumped_mirror_is_found_by_the_reference_frame(bump: dict[str, float],
     assert words in stopped.message and "bumped" in stopped.message, stopped.message
     assert sum("in doubt, bumped before reference 2" in entry for entry in stopped.dropped) == 10
     if "shift_px" in bump:  # left as it stands, it is told again; a tilt may have been aligned anew
-        assert "does not stand as it did before" in rig.run().message
+        assert "is not where it was before" in rig.run().message
     rig.bench.bump.clear()
     result = rig.run()
     assert result.error_code == ErrorCode.OK, result.message
@@ -275,7 +278,7 @@ def test_a_driver_that_was_restarted_stops_the_run(rig: Rig) -> None:
         rig.bench.publish_state()
 
     rig.start()
-    assert "no longer knows what the actuators went through" in rig.run_with(restarted).message
+    assert "no longer knows the history of the actuators" in rig.run_with(restarted).message
     assert rig.run().error_code == ErrorCode.OK
 
 
@@ -286,7 +289,7 @@ def test_a_full_disk_stops_the_run_and_keeps_what_was_measured(rig: Rig) -> None
         resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
     stopped = rig.run_with(lambda: allow(10000))
-    assert stopped.error_code == ErrorCode.STORAGE_FAILED and "could not be kept" in stopped.message
+    assert stopped.error_code == ErrorCode.STORAGE_FAILED and "could not be stored" in stopped.message
     assert (rig.bench.signals == 0.0).all()
     before = len(rig.bench.measured)
     refused = rig.run()

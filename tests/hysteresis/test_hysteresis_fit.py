@@ -233,7 +233,7 @@ def test_a_figure_that_drifts_is_named() -> None:
     drift = np.zeros_like(maps.coefficients)
     drift[:, 5] = np.linspace(0.0, 100e-9, len(maps))
     found = plays(replace(maps, coefficients=maps.coefficients + drift))
-    assert any("the figure drifted by more than earlier creep explains" in remark for remark in found.remarks)
+    assert any("the figure drifted more than earlier creep can explain" in remark for remark in found.remarks)
 
 
 def test_a_map_of_something_else_does_not_enter_the_law() -> None:

@@ -57,14 +57,14 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
     found = forecast(plan, 0.5, None, mirror, until=2e-9)
     assert 1e-9 < found.max_zernike < 2e-9 and found.maps < len(plan.steps)
-    assert found.accuracy(2e-9, True).startswith(", moves then right to 1.9 nm (")
+    assert found.accuracy(2e-9, True).startswith(", moves then accurate to 1.9 nm (")
     whole = forecast(plan, 0.5, None, mirror, until=1e-12)
     assert whole.maps == maps_of(plan.steps) and whole.max_zernike == pytest.approx(1.53e-9, rel=0.02)
-    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then right to 1.5 nm (")
+    assert whole.accuracy(1e-12, True).startswith(", not expected to reach 0.001 nm: moves then accurate to 1.5 nm (")
     assert (
         Forecast(170.0, 2.04e-9)
         .accuracy(2e-9, False)
-        .startswith(", not expected to reach 2 nm: moves then right to 2.04 nm (")
+        .startswith(", not expected to reach 2 nm: moves then accurate to 2.04 nm (")
     )
     short = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=100))
     assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.6e-9, rel=0.1)
@@ -124,7 +124,7 @@ def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     enough = GoodEnough(1e-9)
     outcome: Any = SimpleNamespace(maps=lambda: None)
     assert [enough(outcome) for _ in range(4)] == [False, False, False, True]
-    assert "more maps did not help (part by part 9, 5, 4.9, 5 nm)" in enough.sentence(4.9e-9)
+    assert "more maps did not help (after each part: 9, 5, 4.9, 5 nm)" in enough.sentence(4.9e-9)
 
 
 def test_plans_without_check_moves_promise_nothing() -> None:

@@ -80,7 +80,7 @@ def held_out_rms(found: Identification) -> float:
 
 
 def says_alike(found: Identification) -> bool:
-    return any("do not tell the actuators' loops apart" in remark for remark in _remarks(found))
+    return any("show no differences between the actuators' loops" in remark for remark in _remarks(found))
 
 
 @pytest.mark.parametrize("seed", [11, 12])
@@ -163,7 +163,7 @@ def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.Mo
     assert len(asked) == falls and any(found.fit.law is law for law in asked[:-1])
     np.testing.assert_array_equal(found.held_out[check], found.fit.residual[check])  # of the law that is taken
     assert found.refused == {
-        "the fit that takes in the test moves": "its slope falls to -1.00: it could not be inverted safely"
+        "the fit that includes the test moves": "its slope falls to -1.00: it could not be inverted safely"
     }
 
 

@@ -199,7 +199,7 @@ def test_a_controller_that_was_restarted_alone_is_not_judged_by_what_another_nod
     node, figures = suite.observer.node, tmp_path / "figures.json"
     able = node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
     command = [sys.executable, "-m", "dm_tools", "check", "--json", str(figures)]
-    for lost in ("it moved before this node followed it", ""):
+    for lost in ("the mirror moved before this node followed it", ""):
         able.publish(
             Capabilities(error_bound=2.5e-7, message=f"all; {lost and HISTORY_UNKNOWN}{lost}; without actuator 6")
         )
@@ -216,7 +216,7 @@ def test_it_goes_on_without_an_actuator_that_died(suite: Suite) -> None:
     suite.bench.move(np.full(suite.bench.mirror.actuators, 0.4))
     time.sleep(2 * STILL_S)
     named = suite.call()
-    assert not named.accepted and named.message.endswith("./dm check --without 7 goes on without what does not move")
+    assert not named.accepted and named.message.endswith("./dm check --without 7 continues without what does not move")
     assert suite.call(without=[99]).error_code == ErrorCode.OUT_OF_RANGE
     assert suite.call(without=[7], forget=True).error_code == ErrorCode.INVALID_ARGUMENT
     suite.status("The last map disagrees with this calibration: bounds are wider until one agrees")
@@ -224,13 +224,13 @@ def test_it_goes_on_without_an_actuator_that_died(suite: Suite) -> None:
     tried = subprocess.run([*command, "--dry-run"], capture_output=True, text=True, timeout=60)
     assert tried.returncode == 0 and "nothing is changed yet" in tried.stdout, tried.stdout + tried.stderr
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0 and "Goes on without actuator 7 (stands at " in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0 and "Used without actuator 7 (fixed at " in done.stdout, done.stdout + done.stderr
     suite.expect(1)
     assert suite.calibration.actuator_grade[6] == "dead"
-    assert any("Goes on without actuator 7" in sentence for sentence in suite.calibration.known_limitations)
+    assert any("Used without actuator 7" in sentence for sentence in suite.calibration.known_limitations)
     suite.shape()
     assert suite.call().accepted
-    suite.status("Goes on without actuator 7")
+    suite.status("Used without actuator 7")
 
 
 def test_switched_off_only_the_service_takes_maps(begin: Callable[..., Suite]) -> None:
@@ -246,7 +246,7 @@ def test_the_mirror_moved_or_the_map_is_another(suite: Suite) -> None:
     time.sleep(STILL_S / 2)
     suite.bench.move(suite.bench.mirror.rest)
     suite.bench.publish_map(old)
-    wait_until(lambda: "map not taken: the mirror moved" in suite.process.output, 60, suite.process.output)
+    wait_until(lambda: "map not used: the mirror moved" in suite.process.output, 60, suite.process.output)
     figures = {pair.key: pair.value for pair in suite.status("calibration steady").values}
     assert figures["maps_refused"] == "1"
     assert "s after the stamp of the map: must stand still for 0.1 s" in figures["last_refusal"]

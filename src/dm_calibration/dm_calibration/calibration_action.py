@@ -136,7 +136,7 @@ class CalibrateAction:
         kept = ""
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (
-                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal goes on from there, "
+                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal resumes from there, "
                 "`dm calibrate --fresh` begins anew"
             )
         result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
@@ -211,7 +211,7 @@ class CalibrateAction:
         law = left_of_one_map(self._manager.in_use, self._mirror)
         step, until = feedback.step, self._goal.until
         self._end, feedback.expected_max_zernike = expected_end(self._plan, step, reached, until, law)
-        self._node.get_logger().info(f"{maps} maps: right to {reached * 1e9:.2f} nm")
+        self._node.get_logger().info(f"{maps} maps: accurate to {reached * 1e9:.2f} nm")
 
     def _conclude(self, run: OpenRun, runs: UnfinishedRuns, enough: GoodEnough) -> None:
         """Fit, check, store and publish; fills the result. The journal is removed once everything is on disk."""

@@ -118,8 +118,9 @@ class CalibrationManager:
                 warnings.append(f"warning: {error}")
             if before is not None and calibration.promise > CLEARLY_WORSE * before.promise:
                 warnings.append(
-                    f"warning: it promises {in_nanometres(calibration.promise)}, {before.id} that it replaces "
-                    f"{in_nanometres(before.promise)} (load_calibration brings that back)"
+                    f"warning: it promises {in_nanometres(calibration.promise)}, clearly worse than "
+                    f"{in_nanometres(before.promise)} of {before.id}, which it replaces (load_calibration brings that "
+                    "back)"
                 )
         return "; ".join(warnings)
 
@@ -173,7 +174,7 @@ class CalibrationManager:
             try:
                 return self.load(last)
             except EXPECTED as error:
-                reason = f"in use last was {last}: {error}"
+                reason = f"the calibration last in use, {last}, cannot be loaded: {error}"
         calibration, warning = self.load("")
         return calibration, reason or warning
 
@@ -204,7 +205,7 @@ class CalibrationManager:
             StoreError: it could not be written; file and calibration in use are unchanged.
         """
         if not book.recipes:
-            raise RecipeError("recipes: must hold at least one")
+            raise RecipeError("recipes is empty: must hold at least one")
         with self._changing:
             before = self._checked_in_use(calibration_id)
             count, has = len(book.recipes[0].effective), before.fit.actuators
@@ -231,7 +232,7 @@ class CalibrationManager:
             file = self.store.save(calibration)
         stored = self.store.load(calibration.id)
         if raw_hash(stored) != raw_hash(calibration):
-            raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")
+            raise StoreError(f"calibration {calibration.id}: the maps in {file} differ from those measured")
         return file, stored
 
     def provenance(self, name: str, serial: str, note: str) -> Provenance:

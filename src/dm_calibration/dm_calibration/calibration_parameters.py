@@ -31,8 +31,8 @@ PARAMETERS = (
     Parameter(
         "state_folder",
         text(STATE_FOLDER, path=True),
-        "Folder in which focus_controller keeps what actuators have crept to, its state_folder: read at the start, so "
-        "that maps are compared with the same creep; empty = not known.",
+        "The state_folder of focus_controller, in which it keeps the creep state of the actuators: read at the start, "
+        "so that maps are compared with the same creep; empty = not known.",
     ),
     *parameters_of("", PlanOptions),
     live("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time."),

@@ -136,12 +136,12 @@ def calibrate(
     limitations = [*fit.limitations, *(found.remarks if found else ()), *run_limitations]
     if not outcome.radius_known:
         limitations.append(
-            "The maps do not tell their aperture radius; the mirror's working aperture "
-            f"({mirror.working_radius * 1e3:.2f} mm radius) is taken."
+            f"The maps state no aperture radius; the mirror's working aperture ({mirror.working_radius * 1e3:.2f} mm "
+            "radius) is used."
         )
     wavelength = outcome.setup.wavelength if outcome.setup else 0.0
     if wavelength == 0.0:
-        limitations.append("The maps do not tell their wavelength.")
+        limitations.append("The maps state no wavelength.")
     seen = measured.stamp_ns[np.isfinite(measured.coefficients).all(axis=1)]  # others may have estimated times
     if found and commands is not None and times is None and not (seen % 10**9).any():
         limitations.append("Times of the maps are whole seconds: creep of the first seconds is not well known.")
@@ -225,7 +225,7 @@ def refit(
     poked = _poke_sentences(check_fit(fit, mirror))  # a map left out may have been the cause of a finding
     without = f" without {', '.join(exclude)}" if exclude else ""
     if exclude and stored.hysteresis is not None:
-        without += "; the hysteresis model, and the promise, are those of all its maps"
+        without += "; the hysteresis model and the promise are still those of all maps"
     return replace(
         stored,
         id=provenance.id,

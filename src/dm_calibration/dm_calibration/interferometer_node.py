@@ -218,8 +218,8 @@ class InterferometerNode(ManagedNode):
         self.get_logger().info(f"{what}: {surface.file or surface.instrument}: {shown}{_mended(surface)}")
         if surface.pitch is None:
             self.get_logger().warning(
-                f"{surface.file}: the file does not tell its lateral resolution, so coefficients carry "
-                "radius 0 (unknown); set the parameter `pitch` [m per pixel]",
+                f"{surface.file}: the file states no lateral resolution, so coefficients carry radius 0 (unknown); "
+                "set the parameter `pitch` [m per pixel]",
                 once=True,
             )
 

@@ -71,14 +71,15 @@ def configure(
     for name in ("aperture.follow", "aperture.centre_x", "aperture.centre_y"):
         if values[name] and not values["aperture.radius"]:
             raise ValueError(
-                f"{name} = {values[name]}: counts only with aperture.radius, which is 0: the aperture is what is seen"
+                f"{name} = {values[name]}: has an effect only with aperture.radius, which is 0: the aperture is found "
+                "in each map"
             )
     try:
         validate_topic_name(topic or "none")
     except InvalidTopicNameException as error:
         raise ValueError(f"zernike_topic = {topic!r}: {error}") from error
     if topic and resolve(topic) == resolve("zernike"):
-        raise ValueError(f"zernike_topic = {topic!r}: is what this node itself publishes")
+        raise ValueError(f"zernike_topic = {topic!r}: must not be a topic that this node itself publishes")
     path, unit = values["reference_surface"], values["xyz_unit"]
     expected = values["wavelength.expected"], values["wavelength.tolerance"]
     folder = Path(values["watch_folder"]).expanduser() if values["watch_folder"] else None

@@ -66,7 +66,7 @@ def test_two_mirrors_in_view_are_refused() -> None:
 @pytest.mark.parametrize("apart", [150, 140])
 def test_two_mirrors_that_touch_are_refused(apart: float) -> None:
     both = disc((200, 400), 100, 100, 90) | disc((200, 400), 100 + apart, 100, 60)
-    with pytest.raises(InsufficientDataError, match=r"no disc: beside a circle of 90 pixels .* another mirror in view"):
+    with pytest.raises(InsufficientDataError, match=r"not one disc: circles of 90 and .* another mirror in view"):
         find_aperture(both)
 
 

@@ -65,7 +65,7 @@ def test_a_map_gets_the_signals_of_its_own_time(history: AppliedHistory, driver:
 @pytest.mark.parametrize(
     ("time", "words"),
     [
-        (-1.0, "no report so old"),
+        (-1.0, "no actuator_state from that time"),
         (10.4, r"moved 0.400 s before the stamp of the map: must stand still for 1 s"),
         (19.5, r"moved 0.500 s after the stamp of the map"),
         (30.5, "pdm_driver was not active"),
@@ -168,7 +168,7 @@ def test_another_number_of_signals_starts_anew(history: AppliedHistory, driver: 
     driver.signals = np.zeros(3)
     with pytest.raises(ValueError, match="applied: 3 signals, before there were 2"):
         driver.report(2.0)
-    with pytest.raises(MapNotUsableError, match="no report so old"):
+    with pytest.raises(MapNotUsableError, match="no actuator_state from that time"):
         history.settled(5.0, 1.0)
 
 

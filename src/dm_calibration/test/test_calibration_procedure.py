@@ -136,7 +136,7 @@ def test_failures_that_are_not_in_a_row_do_not_end_it(bench: LinearBench, mirror
     ("change", "words"),
     [
         ({"radius": 10e-3}, "aperture radius 10.000 mm, the mirror's is 11.000 mm +-2.0%: never mix"),
-        ({"wavelength": 1064e-9}, "wavelength 1064.000 nm, before it was 632.800 nm (0 = not known): never mix"),
+        ({"wavelength": 1064e-9}, "wavelength 1064.000 nm, in the maps before 632.800 nm (0 = not known): never mix"),
         ({"wavelength": 0.0}, "wavelength 0.000 nm"),
         ({"system_error_subtracted": 1}, "never mix"),
         ({"coefficients": np.zeros(15)}, "15 Zernike terms"),
@@ -209,7 +209,7 @@ def test_shapes_without_a_model_are_dropped_in_words(bench: LinearBench, mirror:
     procedure = Procedure(plan, mirror, bench)
     outcome = procedure.run()
     assert len(outcome.dropped) == 1
-    assert outcome.dropped[0].startswith("p55: no influence function to solve its signals from")
+    assert outcome.dropped[0].startswith("p55: its signals need an influence function")
     assert [record.label for record in outcome.records] == ["reference 1", "p01", "reference 2"]
 
 

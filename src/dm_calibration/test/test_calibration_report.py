@@ -216,12 +216,12 @@ def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibrat
     first = html_page("", sections(calibration, file)[:1])
     for expected in (
         "approximate:",
-        "calibrate again; Goes on without actuator 5 (stands at -1.00)</td>",
+        "calibrate again; Used without actuator 5 (fixed at -1.00)</td>",
         "./dm status",
     ):
         assert expected in first
     patient = html_page("", sections(calibration, file, JUDGED_BY | {"updates.surprises_max": 4})[:1])
-    assert "calibrate again" not in patient and "Goes on without actuator 5" in patient
+    assert "calibrate again" not in patient and "Used without actuator 5" in patient
 
 
 def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[Check]:

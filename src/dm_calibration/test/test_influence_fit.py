@@ -93,7 +93,7 @@ def test_it_is_the_least_squares_solution_of_equation_6(mirror: Mirror) -> None:
     expected = np.linalg.lstsq(design, maps.coefficients, rcond=None)[0]
     assert fit.influence_zernike == pytest.approx(expected[1:].T, abs=1e-6 * NM)
     assert fit.zernike_offset == pytest.approx(expected[0], abs=1e-6 * NM)
-    assert any("too few reference frames, or too few maps beside them" in sentence for sentence in fit.limitations)
+    assert any("too few reference frames, or too few other maps" in sentence for sentence in fit.limitations)
 
 
 def test_unknown_piston_and_tilt_do_not_disturb(mirror: Mirror) -> None:
@@ -157,7 +157,7 @@ def test_maps_that_nothing_else_can_predict_do_not_count_as_held_out(mirror: Mir
     assert not tested.any()
     fit = fit_influence(one_sided, limits=mirror.limits)
     text = " ".join(fit.limitations)
-    assert "held-out error is one of extrapolation" in text and "show hysteresis" not in text
+    assert "held-out error comes from extrapolation" in text and "show hysteresis" not in text
     assert np.isfinite([fit.held_out_rms, fit.held_out_max_zernike]).all()
     mixed = maps.select(np.array([label != "poke-09" for label in maps.label]))
     fit = fit_influence(mixed)
@@ -329,7 +329,7 @@ def test_too_few_maps_are_refused_in_words(mirror: Mirror) -> None:
     with pytest.raises(TooFewMapsError, match=r"\d+ good maps for \d+ unknowns"):
         fit_influence(few.select(alone).select(np.array([True, True, False, True, False, False])))
     together = replace(maps, applied=np.repeat(maps.applied.sum(axis=1, keepdims=True), 37, axis=1))
-    with pytest.raises(TooFewMapsError, match="do not tell the actuators 1, 2, 3"):
+    with pytest.raises(TooFewMapsError, match="do not separate actuators 1, 2, 3"):
         fit_influence(together)
     still = replace(maps, applied=np.zeros_like(maps.applied))
     with pytest.raises(TooFewMapsError, match="no actuator was moved"):

@@ -138,10 +138,15 @@ def test_a_sphere_of_known_radius_gives_the_lateral_scale(surface: Path) -> None
     for seen_as, expected in ((wrong, 0.05 * 1.003**2), (right, 0.05)):
         found = curvature_of_defocus(seen_as.coefficients[DEFOCUS], seen_as.radius)
         assert found == pytest.approx(expected, rel=1e-4)
-    for radius, text in ((1.5, "a sphere of 1.5 m, and the map shows -"), (-3.0, "not a sphere of -3 m")):
+    for radius, text in (
+        (1.5, "radius of curvature = 1.5 m: must have the sign of the map's defocus, -"),
+        (-3.0, "not a sphere of -3 m"),
+    ):
         with pytest.raises(ValueError, match=text):
             pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, radius)
-    with pytest.raises(MapRejectedError, match=r"pitch 200.000 um, the parameter says 220.000 um: another zoom"):
+    with pytest.raises(
+        MapRejectedError, match=r"pitch of the file = 200.000 um, parameter pitch = 220.000 um: another zoom"
+    ):
         Ingest().read(surface, IngestSettings(pitch=1.1 * PITCH))
 
 
@@ -185,7 +190,7 @@ def test_refusals_name_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(MapRejectedError, match=r"wavelength = 632\.800 nm: must be 1064\.000 nm within 1 nm"):
         ingest.read(path, IngestSettings(wavelength=1064e-9))
     assert ingest.read(path, IngestSettings(wavelength=WAVELENGTH))[0].pitch is None
-    with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.011 m, but the file does not tell"):
+    with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.011 m, but the file states no"):
         ingest.read(path, IngestSettings(aperture_radius=0.011))
     _, found = ingest.read(path, IngestSettings(aperture_radius=0.011, pitch=0.022 / 60))
     assert found.radius_px == pytest.approx(30)

@@ -94,7 +94,7 @@ def test_facts_of_a_fits_file(tmp_path: Path) -> None:
         ({"BUNIT": "waves"}, "BUNIT = 'waves': must be a length"),
         ({"NAXIS": 3}, "NAXIS = 3: must be one of 2"),
         ({"BITPIX": 12}, "BITPIX = 12: must be one of 8"),
-        ({"NAXIS1": 13}, "the values go on behind so many"),
+        ({"NAXIS1": 13}, "the file holds more values"),
         ({"NAXIS2": 40000}, "file length = 5760 bytes: must be"),
         ({"BSCALE": 1e30}, "height = "),
         ({"WAVELEN": 0.5}, "wavelength = 0.5 m"),

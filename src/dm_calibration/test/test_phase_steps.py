@@ -59,7 +59,7 @@ def test_what_was_counted_right_stays_as_it_is(sag: NDArray[np.float64]) -> None
 
 
 def test_another_step_is_refused_by_its_place(sag: NDArray[np.float64]) -> None:
-    with pytest.raises(MapRejectedError, match=r"about column 1[67]\d, row (99|100) stands \+1.50 fringes off"):
+    with pytest.raises(MapRejectedError, match=r"about column 1[67]\d, row (99|100) is \+1.50 fringes off"):
         mend_phase_steps(sag + 1.5 * FRINGE * (X > 0.4), FRINGE)
 
 

@@ -72,7 +72,8 @@ def test_cycle_of_three() -> None:
     order = np.arange(37)
     order[[4, 9, 30]] = order[[9, 30, 4]]
     assert check(response()[:, order]).findings == (
-        "actuators 5, 10, 31 are permuted: 5 moves the place of 10, 10 moves the place of 31, 31 moves the place of 5",
+        "actuators 5, 10, 31 are permuted: "
+        "5 moves the surface at 10, 10 moves the surface at 31, 31 moves the surface at 5",
     )
 
 
@@ -180,7 +181,7 @@ def test_any_mounting_with_any_faults(
         elif fault == "doubled":  # two actuators on one channel, none on the other
             measured[:, one] += measured[:, other]
             silent[other] = True
-            expected.append(f"actuator {one + 1} moves the places of {numbers[0]} and {numbers[1]} together")
+            expected.append(f"actuator {one + 1} moves the surface at actuators {numbers[0]} and {numbers[1]} together")
         else:
             measured[:, [one, other]] = measured[:, [other, one]]
             place[[one, other]] = other, one
@@ -237,7 +238,7 @@ def test_pokes_too_small_to_see() -> None:
     assert "only 8 of 37 actuators answer above the noise: the pokes are too small" in findings[0]
     # Two that answer as they should say nothing of the pokes.
     findings = check(response(), unmoved=np.arange(37) > 1).findings
-    assert findings == ("2 actuators were moved: wiring and orientation can be checked from 3 on",)
+    assert findings == ("only 2 actuators were moved: a check of wiring and orientation needs 3",)
 
 
 def test_maps_that_show_something_else() -> None:

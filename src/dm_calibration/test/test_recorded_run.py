@@ -78,7 +78,7 @@ def test_a_recording_that_ends_early_is_told() -> None:
 
 def test_a_recording_of_an_earlier_version_is_refused() -> None:
     run, _outcome = recorded(PlanKind.POKES, PlanOptions())
-    with pytest.raises(RecordingError, match="does not tell the plan of the run"):
+    with pytest.raises(RecordingError, match="lacks the plan of the run"):
         repeat_run(replace(run, plan=""))
 
 

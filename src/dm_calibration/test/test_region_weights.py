@@ -141,7 +141,7 @@ def test_place_a_the_weighted_coefficients() -> None:
     with pytest.raises(ValueError, match="20 sampling points for 21 coefficients"):
         coefficient_operator(few, FALLING)
     line = SamplePoints(np.linspace(-1, 1, 50), np.zeros(50), np.full(50, 1 / 50))
-    with pytest.raises(ValueError, match="do not tell the 21 terms apart"):
+    with pytest.raises(ValueError, match="do not separate the 21 terms"):
         coefficient_operator(line, FALLING)
 
 

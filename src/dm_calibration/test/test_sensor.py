@@ -128,5 +128,5 @@ def test_waiting_ends_in_time_and_when_it_is_stopped() -> None:
 def test_a_topic_of_another_namespace_is_not_the_nodes_own() -> None:
     values = {parameter.name: parameter.default for parameter in PARAMETERS}
     for topic, own in (("/zernike", False), ("/left/zernike", True), ("zernike", True), ("sensor/zernike", False)):
-        with pytest.raises(ValueError, match="is what this node itself") if own else nullcontext():
+        with pytest.raises(ValueError, match="a topic that this node itself publishes") if own else nullcontext():
             configure(values | {"zernike_topic": topic}, lambda name: name if name[0] == "/" else f"/left/{name}")

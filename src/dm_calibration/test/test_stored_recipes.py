@@ -79,7 +79,7 @@ def test_the_next_start_uses_what_was_in_use_last(stand: Stand, calibration: Cal
     stand.file.unlink()
     used, reason = stand.manager.load_last()
     assert used.id == "newer" == stand.store.last_in_use(calibration.mirror_serial)
-    assert reason.startswith("in use last was known: calibration 'known': no such file")
+    assert reason.startswith("the calibration last in use, known, cannot be loaded: calibration 'known': no such file")
     for content in (b"newer\n", b"~nobody", b"../newer", b"\xff"):
         (stand.store.folder / "in_use_T-1.txt").write_bytes(content)
         assert stand.manager.load_last()[0].id == "newer"
@@ -91,9 +91,9 @@ def test_the_next_start_uses_what_was_in_use_last(stand: Stand, calibration: Cal
 def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calibration) -> None:
     (stand.store.folder / "in_use_T-1.txt").unlink()
     (stand.store.folder / "in_use_T-1.txt").mkdir()
-    assert "warning: known is in use, but the next start will not know: " in stand.manager.use(calibration)
+    assert "warning: known is in use, but could not be noted for the next start: " in stand.manager.use(calibration)
     assert stand.published[-1] is calibration
-    assert "the next start will not know: " in stand.manager.load("known")[1]
+    assert "could not be noted for the next start: " in stand.manager.load("known")[1]
 
 
 def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
@@ -127,7 +127,10 @@ def test_one_that_promises_clearly_less_is_used_with_a_warning(stand: Stand, cal
         return made
 
     assert stand.manager.use(promising(1.9)) == ""
-    assert "warning: it promises" in (said := stand.manager.use(promising(40.0))) and "of_1.9 that it replaces" in said
+    assert (
+        "warning: it promises" in (said := stand.manager.use(promising(40.0)))
+        and "of of_1.9, which it replaces" in said
+    )
     assert stand.manager.in_use is not None and stand.manager.in_use.id == "of_40"
     assert stand.manager.use(calibration) == ""
 
@@ -161,7 +164,7 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
         ),
         ("known", lambda: book(0.01, actuators=19), ErrorCode.INVALID_LENGTH, "effective has 19 values"),
         ("known", lambda: NO_RECIPES, ErrorCode.INVALID_ARGUMENT, "must hold at least one"),
-        ("known", lambda: book(0.02, steps=50), ErrorCode.INVALID_ARGUMENT, "degauss_steps = 50: the recipes there"),
+        ("known", lambda: book(0.02, steps=50), ErrorCode.INVALID_ARGUMENT, "degauss_steps = 50: must be"),
     ],
 )
 def test_recipes_that_do_not_belong_are_refused(

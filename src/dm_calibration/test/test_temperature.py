@@ -71,8 +71,8 @@ def test_readings_that_are_none_are_left_out(node: Node, log: TemperatureLog) ->
         node.say(value, seconds)
     assert log.now() != log.now()
     assert node.warnings[1:] == [
-        "reading not taken: temperature = 10000 degC: must be -100 to 200 degC",
-        "reading not taken: header.stamp is 4000 s ahead of now",
+        "temperature reading ignored: temperature = 10000 degC: must be -100 to 200 degC",
+        "temperature reading ignored: header.stamp is 4000 s ahead of now",
     ]
     node.say(21.0, 0.0)  # without a stamp it is of now
     assert log.now() == 21.0

@@ -220,7 +220,7 @@ def calibration_disk_full(runs: _Runs, random: Random) -> None:
     begun = time.monotonic()
     resource.prlimit(process, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
     runs.record.injected += 1
-    _stopped(runs, "could not be kept")
+    _stopped(runs, "could not be stored")
     resource.prlimit(process, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     runs.finish(runs.kept(), 1, begun)
 

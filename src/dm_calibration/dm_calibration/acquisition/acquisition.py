@@ -94,7 +94,7 @@ class Acquisition:
             on_trouble: called in that thread with each new problem: a file refused unread, or an unreadable folder.
         """
         self.settings = settings
-        self.source = str(settings.folder or "files named to ingest_file only")
+        self.source = str(settings.folder or "only files given to ingest_file")
         self.folder_trouble = ""
         self._complain_at: float | None = None
         self._read = read
@@ -240,7 +240,8 @@ class Acquisition:
                     if self._too_soon:
                         delay = self.settings.file_delay
                         reason += (
-                            f"; {self._too_soon} ended within file_delay, {delay:g} s, of the request by their times"
+                            f"; {self._too_soon} ended less than file_delay = {delay:g} s after the request by their "
+                            "times"
                         )
                     raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
 

@@ -151,7 +151,7 @@ class FolderWatch:
             if not stat.S_ISREG(target.stat().st_mode):
                 return FileEvent(path, signature, "not a regular file")
             if path.is_symlink() and target.parent == self.folder.resolve() and self._matches(target.name):
-                return FileEvent(path, signature, f"a link to {target.name}, which is taken under its own name")
+                return FileEvent(path, signature, f"a link to {target.name}, which is read under its own name")
         except OSError as error:
             return FileEvent(path, signature, f"{error.strerror}")
         return FileEvent(target if path.is_symlink() else path, signature)

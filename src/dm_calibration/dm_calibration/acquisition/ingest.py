@@ -162,7 +162,8 @@ class Ingest:
             )
         if source.pitch and settings.pitch and abs(source.pitch - settings.pitch) > ZOOM_SHARE * settings.pitch:
             raise MapRejectedError(
-                f"pitch {source.pitch * 1e6:.3f} um, the parameter says {settings.pitch * 1e6:.3f} um: another zoom?"
+                f"pitch of the file = {source.pitch * 1e6:.3f} um, parameter pitch = {settings.pitch * 1e6:.3f} um: "
+                "another zoom?"
             )
         pitch = settings.pitch or source.pitch
         sag, subtracted = source.sag, source.system_error_subtracted
@@ -231,8 +232,8 @@ class Ingest:
             raise MapRejectedError(wrong)
         if pitch is None:
             raise MapRejectedError(
-                f"aperture.radius = {settings.aperture_radius:g} m, but the file does not tell its lateral resolution: "
-                "set the parameter pitch, or aperture.radius to 0"
+                f"aperture.radius = {settings.aperture_radius:g} m, but the file states no lateral resolution: set "
+                "the parameter pitch, or aperture.radius to 0"
             )
         wanted = Aperture.configured(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
         if not settings.aperture_follow:

@@ -70,17 +70,17 @@ def outcome_of(
         if taken.shape != (count,) or not (np.abs(taken) < TIME_MAX_S).all():
             raise ValueError(
                 f"times has the shape {taken.shape} and goes up to {np.abs(taken).max(initial=0.0):g}: must be "
-                f"({count},) numbers of s, not of ns, within {TIME_MAX_S:g}"
+                f"({count},) times in s, not ns, up to {TIME_MAX_S:g}"
             )
         measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
     elif not all(one.stamp_ns for one in measured):
         if moved is not None:
-            raise ValueError("moved: needs the times of the maps, which neither `times` nor the files tell")
+            raise ValueError("moved: needs the times of the maps, which neither `times` nor the files state")
         if hysteresis:
             untold = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
             raise ValueError(
-                f"times: map {untold} tells none, and without hysteresis and creep cannot be told apart: give s, one "
-                "for each map"
+                f"times: map {untold} has none, without which hysteresis cannot be separated from creep: give one in "
+                "s for each map"
             )
         last = time.time_ns()
         measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
@@ -119,7 +119,9 @@ def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Float
     taken, shapes = seconds_of(times, "times"), None if moved is None else seconds_of(moved, "moved")
     last = taken.max(initial=-np.inf)
     if time.time() + AHEAD_MAX_S < last < TIME_MAX_S:  # beyond that it is no number of s
-        raise ValueError(f"times go up to {last:g} s, which lies ahead: must count from 1970, or from the first map")
+        raise ValueError(
+            f"times go up to {last:g} s, which is in the future: must count in s from 1970, or from the first map"
+        )
     shift = time.time() - last if last < UNIX_MIN_S else 0.0
     return taken + shift, None if shapes is None else shapes + shift
 
@@ -136,13 +138,13 @@ def _check_times(measured: Sequence[Measurement], signals: Floats) -> None:
     """Raise ValueError if the times of maps do not separate hysteresis from creep."""
     stamps = np.array([one.stamp_ns for one in measured])
     if not np.ptp(stamps) and len(stamps) > 1:
-        raise ValueError("times: all are the same; hysteresis and creep cannot be told apart so")
+        raise ValueError("times: all are equal, so hysteresis cannot be separated from creep")
     same = (np.diff(stamps) == 0) & np.diff(signals, axis=0).any(axis=1)
     if same.any():
         row = int(same.argmax()) + 1
         raise ValueError(
-            f"times: maps {row} and {row + 1} have the same, but not the same command; give `times` if those of the "
-            "files are whole seconds"
+            f"times: maps {row} and {row + 1} have equal times but different commands; give `times` if the files "
+            "state whole seconds"
         )
 
 
@@ -198,11 +200,11 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
         return replace(measured, stamp_ns=round(1e9 * told) if known else 0, sha256=surface.sha256)
     sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data
     if sag.ndim != 2:
-        raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
+        raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), in m")
     seen = sag[np.isfinite(sag)]
     if seen.size and np.ptp(seen) > SAG_MAX:
         raise ValueError(
-            f"map {number + 1}: its sag spans {np.ptp(seen):.3g}: must be m, not um or nm, within {SAG_MAX:g}"
+            f"map {number + 1}: its sag spans {np.ptp(seen):.3g}: must be in m, not um or nm, up to {SAG_MAX:g}"
         )
     try:
         return ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1]

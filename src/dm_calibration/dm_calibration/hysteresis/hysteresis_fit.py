@@ -133,7 +133,7 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
         return ()
     more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
     return (
-        f"Hysteresis: left out {len(labels)} of {len(maps)} maps, for want of data or since they contradict the model: "
+        f"Hysteresis: {len(labels)} of {len(maps)} maps left out, since they lack data or contradict the model: "
         f"{', '.join(labels[:5])}{more}.",
     )
 
@@ -144,8 +144,8 @@ def _drifted(law: HysteresisModel) -> tuple[str, ...]:
     if most < CREPT_MAX:
         return ()
     return (
-        f"Hysteresis: the figure drifted by more than earlier creep explains (signals of {most:.1f}, where 1 is the "
-        "end of the range): the promise does not include such drift, bounds of requests do.",
+        f"Hysteresis: the figure drifted more than earlier creep can explain (it would take signals of {most:.1f}, "
+        "the range ends at 1): the promise does not include such drift, the bounds of requests do.",
     )
 
 
@@ -237,10 +237,10 @@ def _remarks(found: Identification) -> tuple[str, ...]:
     best = found.fit.candidate.name
     others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
     compared = f"; error of other models relative to it: {others}" if others else ""
-    sentences = [f"Hysteresis: {best} predicts the maps left out best{compared}."]
+    sentences = [f"Hysteresis: {best} predicts the held-out maps best{compared}."]
     tried = any(one.own and one.hysteretic and one.name in found.scores for one in CANDIDATES)
     if tried and not found.fit.candidate.own:
-        sentences.append("Hysteresis: the maps do not tell the actuators' loops apart; all share one law.")
-    sentences += [f"Hysteresis: {name} was not taken: {reason}." for name, reason in found.refused.items()]
+        sentences.append("Hysteresis: the maps show no differences between the actuators' loops; all share one law.")
+    sentences += [f"Hysteresis: {name} was rejected: {reason}." for name, reason in found.refused.items()]
     sentences += filter(None, (found.quiet_remark, found.changed_remark))
     return tuple(sentences)

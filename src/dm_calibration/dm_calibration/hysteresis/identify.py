@@ -68,8 +68,8 @@ class Identification:
             return ""
         names = ", ".join(str(number + 1) for number in self.quiet)
         return (
-            f"Hysteresis: the law of actuator{'s' if len(self.quiet) > 1 else ''} {names} is that of the others: "
-            f"{TURNS_MIN} turns over {SWING_MIN:g} are needed in a run to show its own."
+            f"Hysteresis: the law of actuator{'s' if len(self.quiet) > 1 else ''} {names} is that of the others: its "
+            f"own would need {TURNS_MIN} turns and a swing of {SWING_MIN:g} in the run."
         )
 
     @property
@@ -80,7 +80,7 @@ class Identification:
         names = ", ".join(str(number + 1) for number in np.flatnonzero(self.fit.changed))
         return (
             f"Hysteresis: as found, the law of actuator{'s' if self.fit.changed.sum() > 1 else ''} {names} could not "
-            "be inverted safely; it was changed so that it can."
+            "be inverted safely and was corrected."
         )
 
 
@@ -131,7 +131,7 @@ def identify(
                 common.append((np.inf, whole))
             return
         if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
-            refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not tell its creep"
+            refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not determine its creep"
             return
         gain = _size(run, best[2].residual[train]) / _size(run, whole.residual[train]) if best else np.inf
         if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
@@ -169,7 +169,7 @@ def identify(
                     held_out[left_out] = problem.fit(usable & ~left_out, fitted).residual[left_out]
         whole = problem.fit(usable, fitted)
         if flat := _too_flat(run, whole, slope_min):
-            refused["the fit that takes in the test moves"] = flat
+            refused["the fit that includes the test moves"] = flat
             held_out = np.where(test[:, None], fitted.residual, np.nan)
         else:
             fitted = whole
@@ -202,7 +202,7 @@ def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
     if slope.min() >= slope_min:
         return ""
     others = int((slope < slope_min).sum()) - 1
-    also = f" (and too far on {others} more)" if others else ""
+    also = f" (and too low on {others} more)" if others else ""
     whose = f"the slope of actuator {slope.argmin() + 1}" if slope.size > 1 else "its slope"
     return f"{whose} falls to {slope.min():.2f}{also}: it could not be inverted safely"
 
@@ -237,9 +237,9 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     if quiet.size == actuators or quiet.size > max(1, int(QUIET_SHARE * actuators)):
         worst = int(quiet[np.argmin(turns[quiet])])
         raise ExcitationError(
-            f"actuator {worst + 1} turned {turns[worst]} times over a swing of {swing[worst]:.2f} "
-            f"({quiet.size} of {actuators} actuators like it): {TURNS_MIN} turns over {SWING_MIN:g} are "
-            "needed: use the hysteresis plan"
+            f"actuator {worst + 1} turned {turns[worst]} times over a swing of {swing[worst]:.2f} ({quiet.size} of "
+            f"{actuators} actuators move too little): {TURNS_MIN} turns and a swing of {SWING_MIN:g} are needed: use "
+            "the hysteresis plan"
         )
     return tuple(quiet.tolist())
 

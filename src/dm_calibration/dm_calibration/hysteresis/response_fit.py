@@ -111,17 +111,17 @@ def identify_response(
     """
     signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
     if values.ndim != 2 or len(values) != len(signals):
-        raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, numbers of a measurement)")
+        raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, values per measurement)")
     seconds, shapes = _seconds(times, moved, len(signals))
     if not np.ptp(seconds) > 0.0:
         raise ValueError("times: all are the same; leave them out where they are not known")
     usable: Bools = np.asarray(np.isfinite(values).all(axis=1))
     if not usable.any():
-        raise ValueError("measured: each row holds NaN or an infinity; leave out columns that do in all rows")
+        raise ValueError("measured: every row holds NaN or infinity; leave out columns that hold them in all rows")
     with np.errstate(over="ignore"):
         size = float(values[usable].std(axis=0).max())
     if not size > 0.0:
-        raise ValueError("measured: nothing in it changes")
+        raise ValueError("measured: all rows are equal, must change with the commands")
     if not size < np.inf:
         raise ValueError(f"measured reaches {np.abs(values[usable]).max():g}: too large to compute with")
     if not candidates or candidates[0].own:
@@ -175,18 +175,18 @@ def _check_apart(signals: Floats) -> None:
     together = moving[size[group.ravel()] > 1] + 1
     if together.size:
         names = ", ".join(map(str, together.tolist()))
-        raise ValueError(f"commands: do not tell the actuators {names} apart: each must move on its own in some row")
+        raise ValueError(f"commands: do not separate actuators {names}: each must move on its own in some row")
 
 
 def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:
     """Times since the first measurement, (count,) s: of the measurements and, if known, of the moves."""
     seconds = np.arange(count, dtype=np.float64) if times is None else seconds_of(times, "times")
     if seconds.shape != (count,):
-        raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), s")
+        raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), in s")
     if not np.isfinite(seconds).all():
         raise ValueError(f"times: number {_first(~np.isfinite(seconds))} is NaN or infinite")
     if not np.abs(seconds).max() < TIME_MAX_S:
-        raise ValueError(f"times go up to {np.abs(seconds).max():g}: must be s, not ns, within {TIME_MAX_S:g}")
+        raise ValueError(f"times go up to {np.abs(seconds).max():g}: must be in s, not ns, up to {TIME_MAX_S:g}")
     if moved is None:
         return seconds - seconds[0], None
     return seconds - seconds[0], between(seconds_of(moved, "moved"), seconds) - seconds[0]
@@ -195,7 +195,7 @@ def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tu
 def seconds_of(values: ArrayLike, name: str) -> Floats:
     """`values` as numbers. Raises ValueError for dates, whose unit would be lost."""
     if np.asarray(values).dtype.kind in "mM":
-        raise ValueError(f"{name}: must be numbers of s, not {np.asarray(values).dtype}")
+        raise ValueError(f"{name}: must be times in s, not {np.asarray(values).dtype}")
     return np.asarray(values, dtype=np.float64)
 
 
@@ -206,14 +206,14 @@ def between(moved: Floats, taken: Floats) -> Floats:
         ValueError: another shape, not finite, or outside these intervals by more than rounding.
     """
     if moved.shape != taken.shape:
-        raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} numbers of s")
+        raise ValueError(f"moved has the shape {moved.shape}: must be {taken.shape} times in s")
     before = np.concatenate(([-TIME_MAX_S], taken[:-1]))
     wrong = ~((moved >= before - _ROUNDED_S) & (moved <= taken + _ROUNDED_S))
     if wrong.any():
         row = int(wrong.argmax())
         raise ValueError(
-            f"moved: number {row + 1} is {moved[row] - taken[row]:+g} s from the time of its map: must lie between the "
-            f"map before ({before[row] - taken[row]:+g} s) and its own"
+            f"moved: number {row + 1} is {moved[row] - taken[row]:+g} s from the time of its map: must lie between "
+            f"the previous map ({before[row] - taken[row]:+g} s) and its own (0 s)"
         )
     return np.clip(moved, before, taken)
 

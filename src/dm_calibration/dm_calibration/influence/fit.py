@@ -139,8 +139,8 @@ def fit_influence(
         remarks.append(weighting.sentence())
     if fitted.worst_outlier(options) is not None:
         remarks.append(
-            f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were "
-            "dropped. Doubt this calibration."
+            f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were dropped. "
+            "This calibration is doubtful."
         )
     return _judge(maps, options, rings, limits, reasons, fitted, remarks)
 
@@ -184,7 +184,7 @@ class _Fitted(NamedTuple):
         # good ones beyond their (narrower) limits, but its own removal reduces the sum most.
         worst = int(np.argmax(np.where(outside, scaled, 0.0)))
         size, most = 1e9 * scaled[worst], 1e9 * limit[worst]
-        return worst, f"outlier: {size:.1f} nm rms from what the maps together say, limit {most:.1f} nm"
+        return worst, f"outlier: {size:.1f} nm rms from the fit to all maps, limit {most:.1f} nm"
 
 
 def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:

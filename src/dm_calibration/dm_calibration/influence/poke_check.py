@@ -60,7 +60,7 @@ class PokeCheck:
         """Pose of the mirror in the maps, with standard errors."""
         found = self.registration
         if found is None:
-            return "not known how the mirror stands"
+            return "orientation of the mirror in the maps not known"
         turn, sigma = np.degrees((found.turn, found.turn_sigma))
         (x, y), error = 1e3 * np.array(found.shift), 1e3 * found.shift_sigma
         return (
@@ -106,7 +106,7 @@ def check_pokes(
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
             "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
             if quiet.any()
-            else f"{active.size} actuators were moved: wiring and orientation can be checked from {ANSWERS_MIN} on"
+            else f"only {active.size} actuators were moved: a check of wiring and orientation needs {ANSWERS_MIN}"
         )
         return replace(nothing, findings=(problem, *findings))
     terms = only_terms(unit[active], points)
@@ -141,7 +141,9 @@ def check_pokes(
         quiet_said = [f"{text} in the maps as they are now: check again once they are corrected" for text in quiet_said]
     findings = quiet_said + pose + _sign_findings(np.sign(found), active) + _place_findings(place)
     for actuator, pair in double.items():
-        findings.append(f"actuator {actuator + 1} moves the places of {pair[0] + 1} and {pair[1] + 1} together")
+        findings.append(
+            f"actuator {actuator + 1} moves the surface at actuators {pair[0] + 1} and {pair[1] + 1} together"
+        )
     alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
     unlike = alone & (np.abs(found) < LIKENESS_MIN)
     findings += _named(unlike, "answer{} in a way that does not look like that of one actuator")
@@ -246,7 +248,7 @@ def _place_findings(place: Ints) -> list[str]:
             findings.append(f"actuators {numbers[0]} and {numbers[1]} are exchanged")
         else:
             chain = ", ".join(
-                f"{a} moves the place of {b}" for a, b in zip(numbers, numbers[1:] + numbers[:1], strict=True)
+                f"{a} moves the surface at {b}" for a, b in zip(numbers, numbers[1:] + numbers[:1], strict=True)
             )
             findings.append(f"actuators {', '.join(map(str, numbers))} are permuted: {chain}")
     return findings

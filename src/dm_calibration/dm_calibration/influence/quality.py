@@ -73,8 +73,8 @@ def blur(response: Floats, standard_error: Floats, excited: Bools, weak_sigmas: 
     if typical * weak_sigmas < 1.0 or not np.isfinite(typical):
         return []  # or nothing responds at all
     return [
-        f"Responses are known to {typical:.0%} only (one standard error, median of the actuators): hysteresis, which a "
-        "hysteresis plan takes apart from them, or noise blurs them all."
+        f"Responses are known to {typical:.0%} only (one standard error, median of the actuators): hysteresis, which "
+        "a hysteresis plan can separate, or noise blurs them all."
     ]
 
 
@@ -149,8 +149,8 @@ def with_loops(error: float, share: float, influence_zernike: Floats, limits: Li
         return error, []
     beyond = float(share / max(used, apart))
     return error + beyond, [
-        f"The maps show hysteresis, and no law follows it: the error allows for {share:.1%} of a move over the whole "
-        f"range ({beyond * 1e9:.0f} nm) beside the {error * 1e9:.0f} nm of held-out maps."
+        f"The maps show hysteresis, which no law describes: the error includes {share:.1%} of a move over the whole "
+        f"range ({beyond * 1e9:.0f} nm) in addition to the {error * 1e9:.0f} nm of held-out maps."
     ]
 
 
@@ -182,9 +182,9 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         tested: (M,) maps that the cross-validation could judge.
     """
     if StepKind.EXCITATION in good.kind:
-        sentences = ["The influence function acts on effective signals; hysteresis and creep are in their model."]
+        sentences = ["The influence function acts on effective signals, from the model of hysteresis and creep."]
     else:
-        sentences = ["The model is linear: hysteresis and creep stay in its error."]
+        sentences = ["The model is linear: its error includes hysteresis and creep."]
     if not tilt_known:
         sentences.append(
             "The maps do not show the mirror's tilt (the interferometer's own is larger); "
@@ -192,8 +192,8 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         )
     if design.drift == 1:
         sentences.append(
-            "The figure is taken as constant over the run: too few reference frames, or too few maps beside them, to "
-            "follow its drift."
+            "The figure is taken as constant over the run: too few reference frames, or too few other maps, to follow "
+            "its drift."
         )
     for value, text in (
         (GRADE_WEAK, "respond weakly or uncertainly"),
@@ -205,8 +205,8 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
             sentences.append(f"Actuators {', '.join(map(str, numbers))} {text}.")
     if not tested.any():
         sentences.append(
-            "Every map moves an actuator as no other map does: the held-out error is one of extrapolation and tells "
-            "little of the influence function; poke each actuator both ways, or add surfaces."
+            "Every map moves an actuator as no other map does: the held-out error comes from extrapolation and says "
+            "little about the influence function; poke each actuator both ways, or add surfaces."
         )
     elif untested := int((~tested & ~good.reference).sum()):
         sentences.append(

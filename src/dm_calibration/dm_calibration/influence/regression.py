@@ -141,9 +141,7 @@ def least_squares(design: Design, responses: Floats) -> Regression:
         null = right[singular < RANK_TOLERANCE * singular[0]][:, design.drift :]
         involved = np.flatnonzero(design.excited)[np.abs(null).max(axis=0) > 0.02] + 1
         names = ", ".join(str(number) for number in involved) or "all"
-        raise TooFewMapsError(
-            f"the maps do not tell the actuators {names} apart: each must move on its own in some map"
-        )
+        raise TooFewMapsError(f"the maps do not separate actuators {names}: each must move on its own in some map")
     coefficients = scipy.linalg.solve_triangular(r, q.T @ responses)
     inverse = scipy.linalg.solve_triangular(r, np.eye(r.shape[0]))
     return Regression(

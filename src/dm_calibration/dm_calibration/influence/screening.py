@@ -51,9 +51,9 @@ class FitOptions:
     )
     hysteresis_allowance: float = live_parameter(
         real(0.10, 0.0, 1.0),
-        "Share of its moves by which an actuator may miss its target through hysteresis (half the loop, whose width is "
-        "7-15 % of the move) without the map being an outlier, where no hysteresis law is followed. 0 = no hysteresis: "
-        "the error promised for moves is then that of held-out maps.",
+        "Without a hysteresis law: share of its move by which hysteresis may make an actuator miss its target (half "
+        "the loop, whose width is 7-15 % of the move) before the map is an outlier. 0 = no hysteresis: the error "
+        "promised for moves is then that of held-out maps.",
     )
     dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead if the response is below this many standard errors.")
     weak_sigmas: float = live_parameter(
@@ -90,8 +90,8 @@ def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
         elif not valid >= valid_fraction_min:
             reason = f"too few valid pixels: {valid:.1%} of the aperture, at least {valid_fraction_min:.0%} are needed"
         elif partial:
-            reason = f"a part of the surface is missing: {valid:.1%} of the aperture is valid, of most maps {usual:.1%}"
+            reason = f"a part of the surface is missing: {valid:.1%} of the aperture is valid, in most maps {usual:.1%}"
         elif missing > MISSING_POINTS_MAX:
-            reason = f"{missing:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
+            reason = f"{missing:.1%} of the sampling points have no data: must be at most {MISSING_POINTS_MAX:.0%}"
         reasons.append(reason)
     return reasons

@@ -100,5 +100,8 @@ def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
     row = np.sqrt(points.weight) * point_weights(points, weights)
     weighted = row[:, np.newaxis] * basis(points.x, points.y)
     if np.linalg.cond(weighted) > 1.0 / RANK_TOLERANCE:
-        raise ValueError(f"the {len(points)} sampling points do not tell the {len(TERMS)} terms apart: spread them out")
+        raise ValueError(
+            f"the {len(points)} sampling points do not separate the {len(TERMS)} terms: spread the points over the "
+            "aperture"
+        )
     return np.asarray(np.linalg.pinv(weighted) * row)

@@ -47,9 +47,9 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
     size = check_size(width, height) * np.dtype(kind).itemsize
     end = start + -(-size // BLOCK) * BLOCK
     if len(content) < end or len(content) % BLOCK:
-        raise MapFileError(f"file length = {len(content)} bytes: must be {end}, or more by whole blocks of {BLOCK}")
+        raise MapFileError(f"file length = {len(content)} bytes: must be {end}, or longer by whole blocks of {BLOCK}")
     if any(content[start + size : end]):
-        raise MapFileError(f"NAXIS1 x NAXIS2 = {width} x {height}: the values go on behind so many")
+        raise MapFileError(f"NAXIS1 x NAXIS2 = {width} x {height}: the file holds more values")
     # With a valid CHECKSUM the 32-bit words of the file add up to zero in ones' complement.
     if "CHECKSUM" in header and int(np.frombuffer(content[:end], ">u4").sum(dtype=np.uint64)) % 0xFFFFFFFF:
         raise MapFileError("CHECKSUM does not agree with the content: the file is damaged")
@@ -142,7 +142,7 @@ def _real(header: Header, name: str, otherwise: float) -> float:
 def _unit(text: str, name: str) -> float:
     """m per unit."""
     if not text:
-        raise MapFileError(f"{name} is missing: the values have no unit; xyz_unit of the interferometer may tell it")
+        raise MapFileError(f"{name} is missing: the values have no unit; set xyz_unit of the interferometer")
     plain = text.strip().lower().removesuffix("s")
     metres = METRES.get(_SPOKEN.get(plain, plain))
     if metres is None:

@@ -41,7 +41,9 @@ def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
     else:
         group = object_at(file, _NEW)
         if (count := number_in(group, _COUNT)) is not None:
-            raise MapFileError(f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, without it")
+            raise MapFileError(
+                f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, which lacks this attribute"
+            )
         surface = object_at(file, f"{_NEW}/SurfaceInWaves/Data")
         wavelength, no_data, suffix, pitch = 1e-9 * required(group, _WAVELENGTH), np.nan, "4D", None
     sag = check_wavelength(wavelength) * read_heights(surface, content, no_data)

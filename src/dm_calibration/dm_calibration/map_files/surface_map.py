@@ -130,7 +130,8 @@ class SurfaceMap:
             return f"wavelength {self.wavelength * 1e9:.3f} nm, {name} has {reference.wavelength * 1e9:.3f} nm"
         if self.system_error_subtracted:
             return (
-                "the instrument has subtracted its own error already: leave reference_surface empty, or switch that off"
+                "the instrument has subtracted its own error already: leave reference_surface empty, or switch its "
+                "subtraction off"
             )
         return ""
 

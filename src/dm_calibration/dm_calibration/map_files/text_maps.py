@@ -137,7 +137,7 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
     if unit not in XYZ_UNITS:
         what = "not given" if not unit else f"{unit!r}"
         raise MapFileError(
-            f"xyz_unit = {what}: an .xyz file does not tell the unit of its values; must be one of "
+            f"xyz_unit = {what}: an .xyz file does not state the unit of its values; must be one of "
             f"{', '.join(XYZ_UNITS)}"
         )
     header, body = read_header(content)

@@ -19,7 +19,7 @@ _ROUND = 0.02
 SECOND_SHARE = 0.3
 
 #: End of the messages for both cases.
-_SECOND_MIRROR = "is another mirror in view? Mask it, or tell which one by aperture.radius and aperture.centre_*"
+_SECOND_MIRROR = "is another mirror in view? Mask it, or choose one by aperture.radius and aperture.centre_*"
 
 #: Fewest rim points for a circle fit.
 _FEWEST_RIM_POINTS = 16
@@ -110,8 +110,8 @@ def find_aperture(valid: Bools) -> Aperture:
     other = _inscribed_circle(region & ~circle.disc(region.shape))
     if other.radius_px > max(1.0, math.sqrt(SECOND_SHARE) * circle.radius_px):
         raise InsufficientDataError(
-            f"the outline of the map is no disc: beside a circle of {circle.radius_px:.0f} pixels one of "
-            f"{other.radius_px:.0f} fits into it: {_SECOND_MIRROR}"
+            f"the outline of the map is not one disc: circles of {circle.radius_px:.0f} and {other.radius_px:.0f} "
+            f"pixels radius fit into it side by side: {_SECOND_MIRROR}"
         )
     return circle
 

@@ -114,7 +114,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         known = complex(*np.where(determined, solution[: len(determined)], 0.0))
         sag[disc] += np.real(known * _term(everywhere, n, m))
     if len(open_orders) == ORDER + 1:
-        raise ValueError(f"{len(tests)} maps of {', '.join(flats)} tell no flat from another: exchange or turn them")
+        raise ValueError(f"{len(tests)} maps of {', '.join(flats)} do not distinguish the flats: exchange or turn them")
     sigma = np.sqrt(judged / freedom) if freedom else np.nan
     left = np.sqrt(squares / len(tests))
     return FlatError(sag, float(LARGEST_SIGMAS * worst * sigma), float(left), tuple(sorted(open_orders)))

@@ -90,8 +90,8 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
     if left > most:
         tilts = "smaller" if most == LEFT_MAX else "larger"
         raise ValueError(
-            f"coefficients differ by up to {left * 1e9:.1f} nm that do not go with the tilt: must be "
-            f"{most * 1e9:.1f} nm or less; take maps of one shape, by {tilts} tilts, or average them"
+            f"coefficients differ by up to {left * 1e9:.1f} nm that tilt does not explain: must be {most * 1e9:.1f} "
+            f"nm or less; take maps of one shape, with {tilts} tilts, or average them"
         )
     return solution[1:].ravel(), before, left
 
@@ -149,7 +149,7 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
     with np.errstate(invalid="ignore"):
         bounds = 2.0 * np.sqrt((along @ covariance[:2, :2] @ along / size**2, covariance[4, 4]))
     if not bounds.max() < UNCERTAIN_MAX:  # NaN too
-        text = "the marks do not tell scale from distortion: must be exact, and not all as far from the middle"
+        text = "the marks do not separate scale from distortion: must be exact, at different distances from the middle"
         raise ValueError(text)
     return LateralScale(size / half, float(values[4]), float(bounds[0]), float(bounds[1]), left)
 

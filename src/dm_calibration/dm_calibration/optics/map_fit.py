@@ -137,8 +137,8 @@ class MapFitter:
         eigenvalues = np.linalg.eigvalsh(gram / np.outer(scale, scale))
         if eigenvalues[0] < _SINGULAR * eigenvalues[-1]:
             raise InsufficientDataError(
-                f"{self.valid_pixels} valid pixels ({100 * self.valid_fraction:.1f} % of the aperture) are placed so "
-                f"that they cannot tell the {len(TERMS)} terms apart"
+                f"{self.valid_pixels} valid pixels ({100 * self.valid_fraction:.1f} % of the aperture) lie so that "
+                f"they cannot separate the {len(TERMS)} terms"
             )
         self._scale = scale
         self._factor = linalg.cho_factor(gram / np.outer(scale, scale))
@@ -166,7 +166,7 @@ class MapFitter:
         moments, energy = self._moments.of(inner)
         if not math.isfinite(energy):
             missing = np.count_nonzero(self._used & ~np.isfinite(inner))
-            raise ValueError(f"the map has {missing} pixels without data where the mask says there are")
+            raise ValueError(f"the map has no data in {missing} pixels that the mask marks as valid")
         right = _zernike_from_products() @ moments[_B, _A]
         coefficients = linalg.cho_solve(self._factor, right / self._scale) / self._scale
         squares = energy - float(coefficients @ right)

@@ -99,7 +99,7 @@ def _whole(fringes: float, middle: Floats) -> int:
     if abs(fringes - round(fringes)) >= WHOLE:
         row, column = np.round(middle).astype(int)
         raise MapRejectedError(
-            f"the region about column {column}, row {row} stands {fringes:+.2f} fringes off what is beside it: phase "
-            "steps are of whole fringes; is a second surface in view?"
+            f"the region about column {column}, row {row} is {fringes:+.2f} fringes off its surroundings, but phase "
+            "steps are whole fringes: is a second surface in view?"
         )
     return round(fringes)

@@ -67,7 +67,9 @@ class AppliedHistory(HysteresisObserver):
         times = [seen.report.time for seen in observed]
         at = next((k for k in reversed(range(len(observed))) if times[k] <= time), None)
         if at is None:
-            raise MapNotUsableError("what stood at the mirror when the map was taken is not known: no report so old")
+            raise MapNotUsableError(
+                "the signals when the map was taken are not known: no actuator_state from that time"
+            )
         report, estimate = observed[at]
         if not report.active:
             raise MapNotUsableError("pdm_driver was not active when the map was taken")

@@ -46,9 +46,9 @@ class Forecast:
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
-        source = ", median of mirrors drawn at random; one in ten errs twice as much, others more" if drawn else ""
+        source = ", median of mirrors drawn at random; one in ten errs by twice as much or more" if drawn else ""
         reached = told_from(self.max_zernike, until if missed else 0.0)
-        right = f"moves then right to {reached} (largest coefficient, 95 %{source})"
+        right = f"moves then accurate to {reached} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"
 
 
@@ -165,8 +165,8 @@ class GoodEnough:
     def sentence(self, found: float) -> str:
         """A sentence that compares the error `found` (m) at the end of a run with the goal."""
         way = ", ".join(rounded(value * 1e9) for value in self.reached)
-        parts = f" (part by part {way} nm)" if way else ""
+        parts = f" (after each part: {way} nm)" if way else ""
         if found <= self._until:
             return f"{in_nanometres(self._until)} is reached: {in_nanometres(found)}{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{in_nanometres(self._until)} is not reached, {told_from(found, self._until)} is: {reason}{parts}"
+        return f"{in_nanometres(self._until)} is not reached, but {told_from(found, self._until)}: {reason}{parts}"

@@ -41,11 +41,11 @@ def _difference(measured: Measurement, outcome: Outcome, working_radius: float, 
         return different
     first = outcome.records[0] if outcome.records else measured
     if measured.coefficients.shape != first.coefficients.shape:
-        return f"{measured.coefficients.size} Zernike terms, the maps before had others"
+        return f"{measured.coefficients.size} Zernike terms, in the maps before {first.coefficients.size}"
     if abs(measured.radius_px - first.radius_px) > tolerance * first.radius_px > 0.0:
         return (
-            f"aperture of {measured.radius_px:.1f} pixels radius, before it was {first.radius_px:.1f}: the map does "
-            "not show the whole pupil, or another"
+            f"aperture radius {measured.radius_px:.1f} pixels, in the maps before {first.radius_px:.1f}: the map "
+            "shows a part of the pupil, or another one"
         )
     return ""
 
@@ -56,26 +56,32 @@ def _other_setup(measured: Measurement, setup: Setup) -> str:
         return "sampled at other points than the maps before: measure the whole run with one interferometer node"
     if abs(measured.wavelength - setup.wavelength) > WAVELENGTH_TOLERANCE * setup.wavelength:
         return (
-            f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {setup.wavelength * 1e9:.3f} nm "
-            "(0 = not known): never mix wavelengths in one fit, measure the whole run with one instrument"
+            f"wavelength {measured.wavelength * 1e9:.3f} nm, in the maps before {setup.wavelength * 1e9:.3f} nm (0 = "
+            "not known): never mix wavelengths in one fit, measure the whole run with one instrument"
         )
     mixed = "never mix instruments in one fit, measure the whole run with one"
     if measured.instrument != setup.instrument:
-        return f"instrument {measured.instrument!r}, before it was {setup.instrument!r}: {mixed}"
+        return f"instrument {measured.instrument!r}, in the maps before {setup.instrument!r}: {mixed}"
     if measured.camera != setup.camera:
         here, before = ("{} x {}".format(*size) for size in (measured.camera, setup.camera))
-        return f"camera of {here} pixels, before it was {before}: {mixed}"
+        return f"camera of {here} pixels, in the maps before {before}: {mixed}"
     if not np.isclose(measured.pitch, setup.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
         before = f"{setup.pitch * 1e6:.3f} um (0 = not known)"
-        return f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {before}: {mixed}"
+        return f"pixel pitch {measured.pitch * 1e6:.3f} um, in the maps before {before}: {mixed}"
     if measured.orientation != setup.orientation:
         here, before = (
             "flip_x {}, flip_y {}, rotate_deg {:g}".format(*each) for each in (measured.orientation, setup.orientation)
         )
-        return f"orientation {here}, before it was {before}: leave the interferometer's orientation.* alone in a run"
+        return (
+            f"orientation {here}, in the maps before {before}: do not change the interferometer's orientation.* in a "
+            "run"
+        )
     if measured.reference_surface != setup.reference_surface:
         here, before = (each or "none" for each in (measured.reference_surface, setup.reference_surface))
-        return f"reference_surface {here}, before it was {before}: leave it alone in a run"
+        return f"reference_surface {here}, in the maps before {before}: do not change it in a run"
     if measured.system_error_subtracted != setup.system_error_subtracted:
-        return "system error subtracted differs from the maps before: never mix them"
+        return (
+            f"system_error_subtracted = {measured.system_error_subtracted}, in the maps before "
+            f"{setup.system_error_subtracted} (1 = the instrument had subtracted its own error): never mix them"
+        )
     return ""

@@ -196,7 +196,7 @@ class Procedure:
         except TooFewMapsError as error:
             if step.in_use:
                 return step
-            reason = f"{step.label}: no influence function to solve its signals from: {error}"
+            reason = f"{step.label}: its signals need an influence function, which the maps do not give yet: {error}"
             self._note(Dropped(number, reason, whole=True))
             return None
         self._note(Solved(surface.target, surface.remark))
@@ -250,8 +250,8 @@ class Procedure:
         if self._swung:
             raise Refusal(
                 ErrorCode.MAP_REJECTED,
-                f"{label}: {suspicion}: the mirror does not stand as it did before the run was interrupted. Put it "
-                "back, or begin anew (`dm calibrate --fresh`)",
+                f"{label}: {suspicion}: the mirror is not where it was before the run was interrupted. Put it back, "
+                "or begin anew (`dm calibrate --fresh`)",
             )
         frames = [index for index, record in enumerate(self.outcome.records) if record.kind == StepKind.REFERENCE]
         doubtful = len(self.outcome.records) - frames[-1] - 1

@@ -75,8 +75,8 @@ class RecordedBench:
         """
         if not self._left or not np.array_equal(self._left[0].requested, signals):
             raise RecordingError(
-                f"a command of the run is not among the {len(self._left)} recorded moves left: "
-                "the recording began late, ended early, or lost messages"
+                f"a command of the run matches none of the {len(self._left)} recorded moves left: the recording began "
+                "late, ended early, or lost messages"
             )
         move = self._left.pop(0)
         end = self._left[0].stamp_ns if self._left else np.iinfo(np.int64).max
@@ -115,9 +115,7 @@ def planned(text: str, mirror: Mirror) -> tuple[Plan, int]:
         kind, count = PlanKind(values.pop("plan")), int(values.pop("maps_per_state"))
         return make_plan(kind, mirror, PlanOptions(**values)), count
     except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(
-            f"the recording does not tell the plan of the run, or another version made it: {error}"
-        ) from error
+        raise RecordingError(f"the recording lacks the plan of the run, or another version made it: {error}") from error
 
 
 def _difference(plan: Plan, moves: Sequence[Move], end: int) -> str:

@@ -102,7 +102,7 @@ def open_run(
     notes = [f"unfinished run {text}" for text in others]
     chosen: Kept | None = None
     for found in resumable:
-        reason = "a newer one goes on" if chosen else _reason_against(found, plan, age_max, fresh, now_ns)
+        reason = "a newer one is resumed" if chosen else _reason_against(found, plan, age_max, fresh, now_ns)
         if not reason:
             chosen = found
             continue
@@ -119,9 +119,7 @@ def open_run(
     if chosen is None:
         return OpenRun(journal, Outcome(remarks=list(plan.remarks)), notes=tuple(notes))
     if chosen.torn:
-        notes.append(
-            f"unfinished run {chosen.folder.name}: the last {chosen.torn} bytes are not whole and do not count"
-        )
+        notes.append(f"unfinished run {chosen.folder.name}: the last {chosen.torn} bytes are incomplete and ignored")
     text = f"resumed run {chosen.folder.name} with {len(chosen.outcome.records)} maps"
     return OpenRun(journal, chosen.outcome, chosen.storing, text, tuple(notes))
 
@@ -137,7 +135,7 @@ def _reason_against(found: Kept, plan: Plan, age_max: float, fresh: bool, now_ns
         return f"it is {age:.0f} s old, resume_max_age is {age_max:.0f} s"
     latest = max((record.stamp_ns for record in found.outcome.records), default=0)
     if plan.kind is PlanKind.HYSTERESIS and now_ns and now_ns < latest:
-        return f"the clock is {1e-9 * (latest - now_ns):.0f} s before its last map: creep needs times that rise"
+        return f"the clock is {1e-9 * (latest - now_ns):.0f} s behind its last map: creep needs rising times"
     return ""
 
 

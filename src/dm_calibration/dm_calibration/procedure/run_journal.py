@@ -84,7 +84,7 @@ class RunJournal:
         """
         frames = _frames(folder)
         end, seal = frames[-1][1:] if frames else (0, FIRST)
-        with storing(f"the run in {folder} cannot go on"):
+        with storing(f"the run in {folder} cannot be resumed"):
             handle = os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW)
             os.ftruncate(handle, end)
         return cls(folder, handle, end, seal)
@@ -112,7 +112,7 @@ class RunJournal:
         """
         frame, seal = encode(event, self._seal)
         what = f"map {event.record.label}" if isinstance(event, MapTaken) else type(event).__name__.lower()
-        with storing(f"the run is kept up to {what}, which could not be kept in {self.folder}"):
+        with storing(f"the run is stored up to {what}, which could not be stored in {self.folder}"):
             try:
                 view, position = memoryview(frame), self._end
                 while view:

@@ -91,7 +91,7 @@ class UnfinishedRuns:
                 continue
             if kept is None:
                 differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
-                others.append(f"{folder.name}: other {', '.join(differing)}: it waits for its own goal")
+                others.append(f"{folder.name}: other {', '.join(differing)}: only the goal that began it resumes it")
             elif kept.maps:
                 found.append(kept)
             else:

@@ -135,7 +135,7 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
     for actuator, (more, probability) in displaced.items():
         stands = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
         if silent[actuator]:
-            stands = "moves, which showed no response in the calibration"
+            stands = "moves, but showed no response in the calibration"
         elif given_up[actuator]:
             stands += ", moves again"
         else:
@@ -144,14 +144,14 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
         shown.append(f"actuator {actuator + 1} {stands} ({probability:.0%})")
     found = ", ".join(shown)
     if given_up[sure].any():
-        return f"{found}; ./dm check --forget takes it back"
+        return f"{found}; ./dm check --forget uses it again"
     if silent[sure].any():
         return f"{found}; ./dm calibrate measures it"
     if not sure or not all(failed(displaced[k]) for k in sure) or len(sure) + given_up.sum() >= len(expected):
         return found
     without = " ".join(f"--without {actuator + 1}" for actuator in sure)
     condition = "if it is at the same place in another shape, " if "weakened" in faults else ""
-    return f"{found}; {condition}./dm check {without} goes on without what does not move"
+    return f"{found}; {condition}./dm check {without} continues without what does not move"
 
 
 def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:

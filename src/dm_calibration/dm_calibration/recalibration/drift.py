@@ -111,7 +111,7 @@ class Drift:
     def given_up(self) -> str:
         """Sentence on the actuators that no longer move and where they stand; "" = all move."""
         indices = np.flatnonzero(np.isfinite(self.stuck))
-        places = ", ".join(f"{index + 1} (stands at {self.stuck[index]:+.2f})" for index in indices)
+        places = ", ".join(f"{index + 1} (fixed at {self.stuck[index]:+.2f})" for index in indices)
         return f"{GOES_ON_WITHOUT}{'s' if indices.size > 1 else ''} {places}" if places else ""
 
     @property

@@ -201,7 +201,7 @@ class DriftFilter:
         for actuator, more, error in zip(actuators, away, sigma, strict=True):
             if np.isnan(stuck[actuator]) and abs(more) <= DISPLACED_SIGMAS * error:
                 raise MapNotUsableError(
-                    f"actuator {actuator + 1} stands at {at[actuator] + more:+.2f} +- {error:.2f}, and should at "
+                    f"actuator {actuator + 1} stands at {at[actuator] + more:+.2f} +- {error:.2f}, expected at "
                     f"{at[actuator]:+.2f}: this shape does not show that it fails; ask for another first"
                 )
             stuck[actuator] = at[actuator] + more

@@ -95,7 +95,7 @@ class MapListener:
             try:
                 remark = self._updates.begin(calibration)
             except ValueError as error:  # use it nevertheless, without updates
-                remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
+                remark = f"calibration {calibration.id if calibration else ''} cannot be updated by maps: {error}"
         if remark:
             self._node.get_logger().warning(remark)
 
@@ -118,7 +118,9 @@ class MapListener:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
         kept = self._updates.in_use
         if kept is not None and (error := kept.filter.warm_error(kept.drift, self._temperatures.now())):
-            doubts.append(f"The topic temperature does not come: up to {1e9 * error:.1f} nm are not corrected.")
+            doubts.append(
+                f"No message on the topic temperature: up to {1e9 * error:.1f} nm of thermal drift are not corrected."
+            )
         return doubts
 
     @property
@@ -175,10 +177,10 @@ class MapListener:
                     self._judge(measured, dry_run=False)
         except EXPECTED as error:
             self._refuse(str(error))
-            log.info(f"map not taken: {error}", throttle_duration_sec=10.0)
+            log.info(f"map not used: {error}", throttle_duration_sec=10.0)
         except Exception as error:  # no map may keep the next one from being taken
             self._refuse(f"{type(error).__name__}: {error}")
-            log.error(f"map not taken: {type(error).__name__}: {error}")
+            log.error(f"map not used: {type(error).__name__}: {error}")
 
     def _judge(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
         """Compare a map with the calibration, and update it if they agree; `_turn` must be held.
@@ -204,7 +206,7 @@ class MapListener:
             self._taken += verdict.accepted
             if not verdict.accepted:
                 self._refuse(verdict.reason)
-                self._node.get_logger().warning(f"map not taken: {verdict.reason}")
+                self._node.get_logger().warning(f"map not used: {verdict.reason}")
             self._changed()
         return verdict
 

@@ -46,7 +46,7 @@ class TemperatureLog:
         else:
             wrong = f"temperature = {message.temperature:g} degC: must be {POSSIBLE[0]:g} to {POSSIBLE[1]:g} degC"
             text = f"header.stamp is {stamp - now:.0f} s ahead of now" if possible else wrong
-            self._node.get_logger().warning(f"reading not taken: {text}", throttle_duration_sec=60.0)
+            self._node.get_logger().warning(f"temperature reading ignored: {text}", throttle_duration_sec=60.0)
 
     def at(self, time: float) -> float:
         """degC at `time` (s): the last reading before it; NaN when there is none that is recent enough."""

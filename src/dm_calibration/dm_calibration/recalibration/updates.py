@@ -98,7 +98,7 @@ class RecalibrationManager:
         if kept is not None and kept.drift.given_up:
             doubts.append(f"{kept.drift.given_up}.")
         if self.ignored:
-            doubts.append(f"What maps showed earlier is not known: {self.ignored}.")
+            doubts.append(f"Corrections by earlier maps are missing: {self.ignored}.")
         return doubts
 
     @property
@@ -149,15 +149,15 @@ class RecalibrationManager:
             check_map(measured, calibration, options)
             if settled.effective.shape != (calibration.fit.actuators,):
                 raise MapNotUsableError(
-                    f"{settled.effective.size} signals stand at the mirror, the calibration has "
-                    f"{calibration.fit.actuators}"
+                    f"the mirror has {settled.effective.size} signals, the calibration {calibration.fit.actuators} "
+                    "actuators"
                 )
             repeat = _repeats(kept, measured.stamp_ns, settled)
             if without:
                 updates = kept.filter.give_up(updates, sorted(set(without)), measured, settled.effective, repeat)
             comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             accepted = comparison.surprise <= options.surprise_max
-            reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
+            reason = f"differs from the prediction by {comparison.surprise:.1f} times the expected difference"
             found = comparison.displaced, updates.reached(settled.effective)
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
@@ -181,7 +181,9 @@ class RecalibrationManager:
                 shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
                 append_check(self._file(calibration.id, LOG_SUFFIX), shown)
             if not accepted and self.mirror_changed:
-                reason = f"{reason}; {changed.surprising} maps in a row did: the mirror has changed: calibrate again"
+                reason = (
+                    f"{reason}; {changed.surprising} maps in a row disagree: the mirror has changed: calibrate again"
+                )
             return Verdict(accepted, reason, comparison)
 
     def forget(self) -> None:
@@ -225,13 +227,13 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
     """
     terms = calibration.maps.terms
     if measured.coefficients.shape != (terms,):
-        raise MapNotUsableError(f"{measured.coefficients.size} Zernike terms, the calibration has {terms}")
+        raise MapNotUsableError(f"the map has {measured.coefficients.size} Zernike terms, the calibration {terms}")
     if not np.isfinite(measured.coefficients).all():
         raise MapNotUsableError("coefficients: hold values that are not finite")
     if not same_points(measured.points, calibration.fit.points):
         raise MapNotUsableError(
-            "sampled at other points than the calibration, which another interferometer node or version was used for: "
-            "calibrate anew"
+            "the map is sampled at other points than the calibration, made with another interferometer node or "
+            "version: calibrate anew"
         )
     if not abs(measured.wavelength - calibration.wavelength) <= WAVELENGTH_TOLERANCE * calibration.wavelength:
         raise MapNotUsableError(

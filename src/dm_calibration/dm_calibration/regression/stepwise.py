@@ -235,8 +235,8 @@ def _check_collinear(x: Floats, names: Sequence[str]) -> None:
     constant = np.flatnonzero(size <= CONSTANT * np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny))
     if constant.size:
         raise TooFewMapsError(
-            f"candidate {names[constant[0]]} is the same for all samples, which the constant says already: "
-            "leave it out, or add samples in which it differs"
+            f"candidate {names[constant[0]]} is the same for all samples, like the constant: leave it out, or add "
+            "samples in which it differs"
         )
     unit = centred / size
     likeness = np.triu(np.abs(unit.T @ unit), 1)
@@ -254,5 +254,5 @@ def _check_collinear(x: Floats, names: Sequence[str]) -> None:
         if dependent.size:
             listed = ", ".join(sorted(names[column] for column in dependent))
             raise TooFewMapsError(
-                f"the other candidates determine {listed}: leave out as many, or add samples that tell them apart"
+                f"the other candidates determine {listed}: leave out as many, or add samples that separate them"
             )

@@ -106,15 +106,17 @@ def certificate(
         within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
         usual = f"largest coefficient error within {within} for half the spheres in the range"
         foretold = f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends"
-    promise = f"{bound}, 95 % bound on the largest coefficient error of an open-loop move beyond the predicted"
+    promise = (
+        f"{bound}, 95 % bound on the largest coefficient error of an open-loop move, in addition to the predicted error"
+    )
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach),
-        ("promise", f"{promise} and what creep may add that no map has shown: each move states its own bound"),
+        ("promise", f"{promise} and to creep that no map has shown: each move states its own bound"),
         ("predicted", foretold),
         ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
-        ("instrument's errors taken off", calibration.reference_surface or "none"),
+        ("instrument's errors subtracted", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(round(until * 1e9))}: {reason}"),
         ("operator", names.get("operator") or "not given (./dm report --operator)"),
@@ -127,7 +129,7 @@ def certificate(
         "Zernike coefficient beyond tilt."
     )
     if since:
-        sentence += " That is as it was measured; ./dm status says what holds since then."
+        sentence += " This holds as measured; ./dm status says what holds since then."
     picture = Picture(
         "responses",
         "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",

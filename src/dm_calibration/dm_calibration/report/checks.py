@@ -35,17 +35,20 @@ def valid_until(
     agreed = [check.time for check in checks if check.accepted]
     stale = max([measured_s, *agreed]) + values["updates.stale_after"]
     if len(checks) < TREND_MIN or checks[-1].time - checks[0].time < TREND_SPAN_S:
-        return stale, "too few checks to see a trend; a check that agrees puts it off"
+        return stale, "too few checks to see a trend; each check that agrees extends it"
     from scipy.stats import theilslopes  # here: it takes as long to import as half of a report's other libraries
 
     time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
     slope, level, low, _high = theilslopes(error, time - time[0], 0.9)
     per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
     if low <= 0.0:
-        return stale, f"no growth of the error beyond chance ({per_month}); a check that agrees puts it off"
+        return stale, f"no growth of the error beyond chance ({per_month}); each check that agrees extends it"
     reached = max(float(time[0] + max(promised - level, 0.0) / slope), float(time[-1]))
     if reached > stale:
-        return stale, f"the error grows by {per_month}, within the promise until then; a check that agrees puts it off"
+        return (
+            stale,
+            f"the error grows by {per_month}, within the promise until then; each check that agrees extends it",
+        )
     return reached, f"the error grows by {per_month} and reaches the promise then"
 
 

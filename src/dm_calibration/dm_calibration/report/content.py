@@ -58,7 +58,7 @@ def summary(calibration: Calibration) -> Section:
     if hysteresis is None:
         kind = (
             "This calibration is linear, without hysteresis: after any move, hysteresis and creep leave an error that "
-            "depends on the moves before. The held-out residual holds it."
+            "depends on the moves before. The held-out residual includes it."
         )
     else:
         kind = (
@@ -71,9 +71,9 @@ def summary(calibration: Calibration) -> Section:
         f"{_counted(warnings, 'warning or limitation', 'warnings and limitations')} below."
     )
     meaning = (
-        "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that had no "
-        "part in it: the honest one. Re-measured is what a map showed after a command of this calibration was applied. "
-        "All lengths are surface sag, piston and tilt removed."
+        "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that had "
+        "no part in it: the figure to rely on. Re-measured is what a map showed after a command of this calibration "
+        "was applied. All lengths are surface sag, piston and tilt removed."
     )
     return Section("Summary", [kind, meaning, counted], [Table("Key figures", ("figure", "value"), rows)])
 

@@ -121,8 +121,8 @@ def coefficients(calibration: Calibration, left: MapSet) -> Section:
     text = "What the fit leaves of each coefficient beyond tilt, rms over the maps. "
     if sigma is not None:
         text += (
-            "Held-out moves are those of the check, predicted by a law that had not seen them; the noise of their maps "
-            "is taken off, so they can lie below the in-sample figure."
+            "Held-out moves are those of the check, predicted by a law not fitted to them; the noise of their maps is "
+            "subtracted, so they can lie below the in-sample figure."
         )
     picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(rms, sigma))
     return Section("Zernike coefficients", [text], [Table("Residual by coefficient", header, rows)], [picture])

@@ -97,7 +97,7 @@ class CalibrationStore:
     def note_in_use(self, calibration: Calibration) -> None:
         """Record on disk, for the next start, that the mirror uses `calibration`. Raises StoreError."""
         if self.last_in_use(calibration.mirror_serial) != calibration.id:
-            with storing(f"{calibration.id} is in use, but the next start will not know"):
+            with storing(f"{calibration.id} is in use, but could not be noted for the next start"):
                 write_whole(self._in_use(calibration.mirror_serial), calibration.id.encode())
 
     def last_in_use(self, serial: str) -> str:
