@@ -206,11 +206,11 @@ def test_what_the_host_refuses_does_not_start(rig: Rig) -> None:
 
 def test_of_a_mirror_that_goes_on_without_an_actuator_no_recipes_are_built(rig: Rig) -> None:
     """They would be withheld once they are stored."""
-    without = ["Poke check: none.", "Goes on without actuator 5 (stands at -1.00)."]
+    without = ["Poke check: none.", "Used without actuator 5 (fixed at -1.00)."]
     rig.host.focus.use(calibration(known_limitations=without), mirror_info())
     _, refused = rig.run(recipes(0.0))
     assert refused.error_code == ErrorCode.NOT_SUPPORTED, refused.message
-    assert "Goes on without actuator 5 (stands at -1.00): `./dm calibrate`" in refused.message
+    assert "Used without actuator 5 (fixed at -1.00): `./dm calibrate`" in refused.message
     assert not (rig.bench.measured or rig.bench.degauss_steps or rig.stored)
 
 
@@ -304,4 +304,4 @@ def test_maps_of_a_mirror_whose_history_was_lost_make_no_recipe(rig: Rig, maps: 
     rig.bench.plant.sag = cut  # type: ignore[method-assign,assignment]
     status, result = rig.run(recipes(0.01))
     assert status == GoalStatus.STATUS_ABORTED and result.error_code == ErrorCode.DRIVER_UNAVAILABLE
-    assert "no longer knows what the actuators went through" in result.message and not rig.stored
+    assert "no longer knows the history of the actuators" in result.message and not rig.stored

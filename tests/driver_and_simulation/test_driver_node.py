@@ -249,7 +249,7 @@ def test_degauss_makes_the_history_known(driver: Driver) -> None:
 def test_a_degauss_that_wipes_too_little_says_so(driver: Driver, goal: Degauss.Goal) -> None:
     answer = driver.observer.run_goal(Degauss, "degauss", goal).result
     assert answer.error_code == ErrorCode.OK
-    assert "the whole range and 5 of them or more to make the history known" in answer.message
+    assert "the history is known only after 5 or more over the whole range" in answer.message
 
 
 def test_a_degauss_has_feedback_and_a_bound_and_is_cancelled_to_the_shape_before(driver: Driver) -> None:

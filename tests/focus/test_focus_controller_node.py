@@ -296,7 +296,7 @@ def test_a_command_that_the_driver_does_not_take_is_told_of(bench: Bench) -> Non
     told = wait_until(lambda: [s for s in bench.focus_states if s.error_code != ErrorCode.OK], 60)[0]
     assert told.curvature == 0.01 and not (told.applied or answer.state.applied)
     assert told.error_code == answer.error_code == ErrorCode.TIMEOUT
-    assert "has not confirmed the command: it keeps the shape from before" in told.message
+    assert "has not confirmed the command: it holds the earlier shape" in told.message
 
 
 def test_requests_are_refused_when_the_driver_falls_silent(bench: Bench) -> None:

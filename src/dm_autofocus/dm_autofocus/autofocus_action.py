@@ -114,7 +114,7 @@ class AutofocusAction(ProbeAction):
         if scale == 1:
             return swept
         return swept + (
-            f"; by their blur the images would fit a focal length of {scale * given:.0f} px, {given:.0f} px is given "
+            f"; the blur of the images fits a focal length of {scale * given:.0f} px, but {given:.0f} px is given "
             f"{where}"
         )
 

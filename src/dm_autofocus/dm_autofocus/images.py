@@ -221,15 +221,15 @@ class SettledGate:
         """
         if newest is not None and newest - self._stamp_lead > now + self._ahead:
             ahead = newest - self._stamp_lead - now
-            return f"the newest is stamped {ahead:.3f} s ahead of the time here; do the clocks agree?"
+            return f"the newest is stamped {ahead:.3f} s ahead of this node's clock; do the clocks agree?"
         if 2 * apart > timeout_s:  # one period may pass until an exposure begins, and another until it has arrived
-            return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
+            return f"the camera takes one image in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
         if newest is None:
             return "none came; is the camera running?"
         if newest == 0:
-            return "they carry no header.stamp, so nobody knows which focus they show; it must be above 0"
+            return "their header.stamp is 0, so their focus is not known; it must be above 0"
         if not self.open_for(newest, now):
             early = self.settled_at + self._stamp_lead - newest
             why = "does the camera still run, do the clocks agree?"
-            return f"the newest was exposed {early:.3f} s before the shape stood; {why}"
+            return f"the newest was exposed {early:.3f} s before the shape was reached; {why}"
         return "they stopped coming"

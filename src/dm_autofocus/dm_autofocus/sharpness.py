@@ -129,7 +129,9 @@ def _finite(image: NDArray) -> NDArray[np.float32]:
     sizes = np.abs(values)
     mean, size = (float(each.mean(dtype=np.float64)) for each in (values, sizes))
     if mean < CANCELLED * size:
-        raise ValueError(f"grey levels below 0 cancel the others: their mean is {mean / size:.0%} of their mean size")
+        raise ValueError(
+            f"negative grey levels cancel the positive ones: the mean is {mean / size:.0%} of the mean absolute value"
+        )
     return np.ldexp(values, -np.frexp(sizes.max())[1])
 
 

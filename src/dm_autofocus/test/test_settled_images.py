@@ -81,19 +81,19 @@ def test_images_stamped_ahead_of_the_time_never_count() -> None:
     assert simulated.open_for(100.4, now=100.2) and not gate.open_for(100.4, now=100.2)
     assert corrected.open_for(100.4, now=100.2), "stamp_lead tells by how much that clock is ahead"
     assert gate.open_for(100.21, now=100.2)
-    assert "stamped 0.200 s ahead of the time here" in gate.reason(100.4, 0.03, 2.0, now=100.2)
-    assert "stamped 2.800 s ahead of the time here" in simulated.reason(103.0, 3.0, 2.0, now=100.2)
+    assert "stamped 0.200 s ahead of this node's clock" in gate.reason(100.4, 0.03, 2.0, now=100.2)
+    assert "stamped 2.800 s ahead of this node's clock" in simulated.reason(103.0, 3.0, 2.0, now=100.2)
 
 
 def test_a_camera_that_stopped_is_not_told_to_set_its_clock() -> None:
     gate = SettledGate(SETTLE)
     gate.sent(100.0, MOVE)
     assert gate.reason(None, 0.03, 2.0) == "none came; is the camera running?"
-    assert "takes one in 3 s" in gate.reason(None, 3.0, 2.0), "or is it that slow?"
+    assert "takes one image in 3 s" in gate.reason(None, 3.0, 2.0), "or is it that slow?"
 
 
 def test_a_stamp_at_the_end_of_a_long_exposure_is_told_as_the_reason() -> None:
     gate = SettledGate(0.0, stamp_lead=3.0)
     gate.sent(100.0)
     gate.written(100.0, moving=False, reached=True)
-    assert "the newest was exposed 1.100 s before the shape stood" in gate.reason(101.9, 0.03, 2.0)
+    assert "the newest was exposed 1.100 s before the shape was reached" in gate.reason(101.9, 0.03, 2.0)

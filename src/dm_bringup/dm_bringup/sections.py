@@ -87,7 +87,9 @@ def values_in(sections: Mapping[str, Mapping[str, Any]], node: str, namespace: s
         for name, value in values.items():
             before = given.get(name, key)
             if found.get(name, value) != value and _covers(key, before) and not _covers(before, key):
-                text = f"{value!r} overrules {found[name]!r} of {before}, for the last counts: put {key} before it"
+                text = (
+                    f"{value!r} overrules {found[name]!r} of {before}, since the last one counts: put {key} before it"
+                )
                 raise ConfigError(f"{key}: {name}: {text}")
             found[name], given[name] = value, key
     return found

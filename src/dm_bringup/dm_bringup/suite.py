@@ -229,7 +229,7 @@ class Suite:
     def _raise_ended(self, name: str) -> NoReturn:
         status = self._processes[name].returncode
         lines = [] if self._echo else self.log(name).read_text(errors="replace").splitlines()[-8:]
-        tail = "; the reason stands above" if self._echo else "".join(f"\n{line}" for line in lines)
+        tail = "; its output above says why" if self._echo else "".join(f"\n{line}" for line in lines)
         raise RuntimeError(f"the node {name} ended with status {status}{tail}")
 
     def stop(self, timeout_s: float = 15.0) -> None:

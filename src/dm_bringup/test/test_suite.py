@@ -147,9 +147,8 @@ def test_a_general_section_that_would_overrule_a_particular_one_is_refused(tmp_p
     file.write_text(of_all + own)
     assert load_config(file, "left")["pdm_driver"] == {"volts.max": 100.0}
     file.write_text(own + of_all)
-    text = (
-        f"{general}: volts.max: 300.0 overrules 100.0 of /left/pdm_driver, for the last counts: put {general} before it"
-    )
+    overruled = "volts.max: 300.0 overrules 100.0 of /left/pdm_driver, since the last one counts"
+    text = f"{general}: {overruled}: put {general} before it"
     with pytest.raises(ConfigError, match=re.escape(text)):
         load_config(file, "left")
     assert load_config(file, "right")["pdm_driver"] == {"volts.max": 300.0}

@@ -116,7 +116,7 @@ class DeformableMirrorClient(Connection):
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
         """The latest message on a topic that it hears. Raises DeformableMirrorError for others, or if none came."""
         if topic not in self._heard:
-            text = f"{topic!r}: must be one of {', '.join(sorted(self._heard))}, or be heard first (hear)"
+            text = f"{topic!r}: must be one of {', '.join(sorted(self._heard))}, or be subscribed to first (hear)"
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")

@@ -204,7 +204,7 @@ class Connection:
             return found is not None and bool(found.header.stamp == stamp)
 
         if not self.wait(arrived):
-            raise DeformableMirrorError(code, f"what was taken did not arrive on {topic}")
+            raise DeformableMirrorError(code, f"the result did not arrive on {topic}")
         return found
 
     def call(self, name: str, request: Any, timeout_s: float | None = None, again: bool = False) -> Any:

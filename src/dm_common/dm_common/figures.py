@@ -49,7 +49,7 @@ def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
         return with_wavelengths(in_nanometres(metres), metres, calibration.wavelength)
 
     if not (math.isfinite(repeatable) and repeatable > 0.0):
-        return "repeatable to what is not known"
+        return "repeatability not known"
     text = f"repeatable to {length(repeatable)}"
     parameters = {"instrument_error": calibration.instrument_error, "scale_error": calibration.scale_error}
     unknown = [name for name, value in parameters.items() if not value > 0.0]

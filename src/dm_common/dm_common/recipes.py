@@ -17,7 +17,7 @@ from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
 
 #: Prefix of the limitation of a calibration that is used without some actuators; its recipes, of all, are withheld.
-GOES_ON_WITHOUT = "Goes on without actuator"
+GOES_ON_WITHOUT = "Used without actuator"
 
 
 class RecipeError(ValueError):
@@ -81,7 +81,7 @@ class RecipeBook:
     def __post_init__(self) -> None:
         shapes = [recipe.shape for recipe in self.recipes]
         if shapes != sorted(set(shapes)):
-            raise RecipeError("recipes: must rise in conic constant, added terms and curvature, each shape once")
+            raise RecipeError("recipes: must be sorted by conic constant, added terms and curvature, each shape once")
         if len({len(recipe.effective) for recipe in self.recipes}) > 1:
             raise RecipeError("recipes: are of mirrors with different numbers of actuators")
         for recipe in self.recipes:
@@ -93,8 +93,8 @@ class RecipeBook:
         """Raise RecipeError if these recipes begin with a degauss of another number of half-swings."""
         if self.degauss_steps and degauss_steps != self.degauss_steps:
             raise RecipeError(
-                f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}: "
-                "must be the same (recipes.degauss_steps), or calibrate anew"
+                f"degauss_steps = {degauss_steps}: must be {self.degauss_steps}, as in the stored recipes "
+                "(recipes.degauss_steps), or calibrate anew"
             )
 
     def merged(self, newer: RecipeBook) -> RecipeBook:

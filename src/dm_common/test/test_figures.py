@@ -56,8 +56,8 @@ def test_a_range_is_rounded_inwards(low: float, high: float, text: str) -> None:
 @pytest.mark.parametrize(
     ("repeatable", "instrument", "scale", "text"),
     [
-        (0.0, 1e-9, 1e-3, "repeatable to what is not known"),
-        (float("nan"), 1e-9, 1e-3, "repeatable to what is not known"),
+        (0.0, 1e-9, 1e-3, "repeatability not known"),
+        (float("nan"), 1e-9, 1e-3, "repeatability not known"),
         (
             2e-9,
             0.0,

@@ -131,7 +131,7 @@ def test_recipes_go_there_and_back() -> None:
 
 
 def test_recipes_that_do_not_fit_together_are_refused() -> None:
-    with pytest.raises(RecipeError, match="must rise"):
+    with pytest.raises(RecipeError, match="must be sorted"):
         RecipeBook((recipe(0.02), recipe(-0.01)), 100, 0.0, 0)
     with pytest.raises(RecipeError, match="effective signals must be finite, one each"):
         RecipeBook((replace(recipe(-0.01), by_model=np.zeros(3)),), 100, 0.0, 0)

@@ -60,7 +60,7 @@ class CreepHold:
     def not_taken(self) -> None:
         """The driver has not taken the last command: go on holding the shape before it, if it is still there."""
         stood = self._monitor.stood
-        self.end("the driver did not take the command")
+        self.end("the driver did not accept the command")
         if stood is not None:
             self._monitor.order = stood
 

@@ -248,7 +248,7 @@ class DriverMonitor:
         if self._heard < command.sent.steady:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
         if stamp_ns(report.header.stamp) < command.sent.ns:
-            return Refusal(ErrorCode.TIMEOUT, f"{text}: it keeps the shape from before, nothing has reached it since")
+            return Refusal(ErrorCode.TIMEOUT, f"{text}: it holds the earlier shape, no command has reached it since")
         if command.expected_turns:  # a creep correction, which another client's command may overtake
             return None
-        return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")
+        return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another command")

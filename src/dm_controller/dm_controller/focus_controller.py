@@ -116,7 +116,7 @@ class FocusController:
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
         effects += self.monitor.settled()
         if gain:
-            text = f"the clock jumped {gain:.0f} s ahead: whether creep went on for so long counts as not known"
+            text = f"the clock jumped {gain:.0f} s ahead: whether the mirror crept for so long is not known"
             effects.append(Log("warning", text))
         return [*effects, *self._news(now, latency_learnt)]
 

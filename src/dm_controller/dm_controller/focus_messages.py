@@ -57,7 +57,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
         state.creep_held = order.creep_held
         first = "the mirror is degaussed first; " if order.pending else ""
         text = (
-            f"{first}{request.curvature:+.4f} 1/m stands in about {move.duration:.2g} s, right to "
+            f"{first}{request.curvature:+.4f} 1/m is reached in about {move.duration:.2g} s, accurate to "
             f"{largest * 1e9:.1f} nm (largest coefficient, 95 %)"
         )
         source = "creep, which nothing corrects" if drift > 0.5 * largest else plan.most

@@ -32,7 +32,7 @@ PARAMETERS: Final = (
     Parameter(
         "settle_time",
         real(SETTLE_S, 0.0, 60.0, "s"),
-        "wait after the last write before a MoveFocus goal succeeds; shapes are planned to be right then",
+        "wait after the last write before a MoveFocus goal succeeds; shapes are planned to be exact then",
     ),
     Parameter("move_timeout", real(10.0, 0.1, 600.0, "s"), "longest time a move may take"),
     live(
@@ -52,7 +52,7 @@ PARAMETERS: Final = (
             0,
             DEGAUSS_STEPS_MIN,
             DEGAUSS_STEPS_MAX,
-            zero="as the recipes were built, without recipes as the driver does",
+            zero="as the recipes were built; without recipes, as in the driver",
         ),
         "half-swings of the degauss that conditions the mirror",
     ),
@@ -138,7 +138,7 @@ BUILD_RECIPES = Fields(
 )
 MOVE_FOCUS = Fields(
     {
-        "tolerance": replace(_TOLERANCE, zero="any inside the reachable range"),
+        "tolerance": replace(_TOLERANCE, zero="any error inside the reachable range"),
         "settle_time": real(0.0, 0.0, 3600.0, "s", zero="as configured"),
     }
 )

@@ -71,8 +71,8 @@ def test_a_command_that_is_confirmed_is_not_told_of() -> None:
 @pytest.mark.parametrize(
     ("last", "code", "text"),
     [
-        (report(stamp_ns=2 * 10**9), ErrorCode.PREEMPTED, "follows another one"),
-        (report(stamp_ns=10**9 - 1), ErrorCode.TIMEOUT, "keeps the shape from before"),
+        (report(stamp_ns=2 * 10**9), ErrorCode.PREEMPTED, "follows another command"),
+        (report(stamp_ns=10**9 - 1), ErrorCode.TIMEOUT, "holds the earlier shape"),
         (report(error_code=ErrorCode.STALE, message="too old"), ErrorCode.STALE, "too old"),
         (report(driver_state=ActuatorState.STATE_INACTIVE), ErrorCode.DRIVER_INACTIVE, "not active"),
         (report(driver_state=ActuatorState.STATE_LINK_LOST), ErrorCode.ELECTRONICS_UNREACHABLE, "lost the link"),
@@ -96,7 +96,7 @@ def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_not
     driver = monitor(timeout=0.0)
     assert driver.untaken(BEGAN + 0.9 * CONFIRM_S) is None
     untaken = driver.untaken(BEGAN + 1.1 * CONFIRM_S)
-    assert untaken is not None and "nothing has reached it" in str(untaken)
+    assert untaken is not None and "no command has reached it" in str(untaken)
     driver = monitor(timeout=0.0)
     assert driver.order is not None and driver.order.command is not None
     driver.order.command.sent = Moment(10**9, 1.0, BEGAN + 1.0)  # no report has come since

@@ -411,7 +411,7 @@ def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its
     fresh = FocusController(VALUES)
     fresh.use(None, None)
     refusal = fresh.unavailable(bench.now)
-    assert refusal is not None and "comes within seconds of this node's start" in str(refusal)
+    assert refusal is not None and "arrives within seconds of this node's start" in str(refusal)
     early = Moment(0, 0.0, bench.time, simulated=True)
     asked = iter([(fresh, bench.now), (fresh, bench.now), (bench.controller, early), (bench.controller, bench.now)])
     host = cast(Any, SimpleNamespace(_started=time.monotonic(), controller=lambda: nullcontext(next(asked))))
@@ -515,7 +515,9 @@ def test_a_degauss_does_not_cure_old_creep() -> None:
     bench.report()
     later = bench.ask(dry_run=True)
     assert move_of(later).plan.max_zernike_upper < 0.3 * move_of(soon).plan.max_zernike_upper
-    assert "most of that for creep of what the mirror held before it was" in state_message(soon, VALUES, None).message
+    assert (
+        "most of that for creep of shapes held before this node followed" in state_message(soon, VALUES, None).message
+    )
     bench.time += 1e8
     bench.report()
     assert "most of that" not in state_message(bench.ask(0.0, dry_run=True), VALUES, None).message

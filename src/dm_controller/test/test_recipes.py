@@ -237,7 +237,9 @@ def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> Non
         r"there are 1 from -0\.0200 to -0\.0200 1/m with conic_constant = -1, 1 from -0\.0300 to -0\.0300 1/m with "
         "conic_constant = 0"
     )
-    with pytest.raises(RecipeError, match=rf"curvature = \+0\.0510 1/m: nothing is extrapolated; {there}"):
+    with pytest.raises(
+        RecipeError, match=rf"curvature = \+0\.0510 1/m: outside the recipes, which are not extrapolated; {there}"
+    ):
         Corrections(alone, PLANNER).find(FocusTarget(0.051))
     # The range ends with the shape, not with the last digit.
     Corrections(alone, PLANNER).find(FocusTarget(float(np.nextafter(-0.02, 0.0)), -2.0))

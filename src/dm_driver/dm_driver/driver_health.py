@@ -67,7 +67,7 @@ def driver_health(
     if not state.enabled:
         return Health(WARN, "inactive: commands are refused", values)
     if writer.unrecorded:
-        return Health(WARN, f"{writer.unrecorded}; after a kill the first frame would be one step", values)
+        return Health(WARN, f"{writer.unrecorded}; if the driver is killed, its next start moves in one step", values)
     # A refusal for want of a link is out of date, as the link is up.
     if refusal is not None and refusal.error_code != ErrorCode.ELECTRONICS_UNREACHABLE:
         return Health(WARN, f"the last command was refused: {refusal}", values)

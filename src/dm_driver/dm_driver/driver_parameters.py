@@ -79,7 +79,7 @@ PARAMETERS: Final = (
         "state_folder",
         text("~/.ros/dm_driver", path=True),
         "Folder for a record of what was last sent to each unit, from which a driver continues in steps after it was "
-        "killed; $ROS_HOME stands for ~/.ros where it is set. Empty = keep no record.",
+        "killed; $ROS_HOME replaces ~/.ros if it is set. Empty = keep no record.",
     ),
     Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
     Parameter("degauss.steps", whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX), "Half-swings of a degauss."),

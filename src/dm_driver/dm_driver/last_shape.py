@@ -85,9 +85,9 @@ class LastShape:
         """(N,) shape at the outputs: as another driver has left it since, else `own`; None = unknown."""
         try:
             if (codes := self.load()) is not None:
-                return limiter.check_shape(scale.signals_of_codes(codes), "what was sent last")
+                return limiter.check_shape(scale.signals_of_codes(codes), "the last shape sent")
         except (OSError, Refusal) as error:  # a Refusal: the limits have changed, and no legal ramp begins there
-            logging.getLogger(__name__).warning("what was recorded last is not gone by: %s", error)
+            logging.getLogger(__name__).warning("the recorded last shape is not used: %s", error)
         return own
 
     def note(self, codes: Shape) -> None:

@@ -65,7 +65,7 @@ def test_who_was_superseded_hears_how_to_keep_others_off(monkeypatch: pytest.Mon
     monkeypatch.setattr(gate, "attempt", lambda *_arguments: (none, move))
     outcome, code, text = degauss_action.DegaussAction(none, gate, {})._carry_out(handle)
     assert (outcome, code) == ("abort", ErrorCode.PREEMPTED)
-    assert ("hold_mirror keeps others off" in text) == (not holder)
+    assert ("hold_mirror keeps other commands away" in text) == (not holder)
 
 
 def test_a_goal_that_was_overtaken_moves_nothing(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> None:

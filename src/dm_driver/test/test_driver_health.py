@@ -19,7 +19,11 @@ from dm_driver.driver_health import driver_health
         ({"history_known": False}, WARN, "history is not known"),
         ({"enabled": False}, WARN, "inactive"),
         ({"link_up": False, "fault": "no route"}, ERROR, "no route"),
-        ({"unrecorded": "the disk is full"}, WARN, "the disk is full; after a kill the first frame would be one step"),
+        (
+            {"unrecorded": "the disk is full"},
+            WARN,
+            "the disk is full; if the driver is killed, its next start moves in one step",
+        ),
         ({"refusal": Refusal(ErrorCode.BUSY, "held")}, WARN, "the last command was refused: held"),
         ({"refusal": Refusal(ErrorCode.BUSY, "held"), "enabled": False}, WARN, "inactive"),
         ({"refusal": Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, "unplugged")}, OK, "active"),

@@ -229,7 +229,7 @@ class DepthFromDefocus(Search):
             self.done = True
             self.step = Step(float(places[-1]))
         elif self.measured >= points:
-            self._give_up("so many images do not say whether focus changes them")
+            self._give_up("even this many images do not show whether focus changes them")
         else:
             self.step = Step(float(ends[gap]) + width * (parts // 2) / parts)
 

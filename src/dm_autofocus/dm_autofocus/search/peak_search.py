@@ -90,7 +90,9 @@ class SearchConfig:
     def check_left(self) -> None:
         """Raise ValueError where hardly anything of the range is left."""
         if self.high - self.low < 2 * self.tolerance:
-            raise ValueError(f"range = {self.low:+.4f} to {self.high:+.4f} 1/m: too little of it is left")
+            raise ValueError(
+                f"range = {self.low:+.4f} to {self.high:+.4f} 1/m: must span {2 * self.tolerance:g} 1/m or more"
+            )
 
 
 @dataclass(frozen=True)

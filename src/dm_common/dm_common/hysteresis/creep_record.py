@@ -73,12 +73,12 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
     except FileNotFoundError:
         return None
     except Exception as error:  # NumPy raises many kinds of error for a damaged file
-        raise ValueError(f"{file}: {error}: what was held before is not known") from error
+        raise ValueError(f"{file}: {error}: earlier creep is not known") from error
     time, creep_time, crept, sigma, lagged = values
     whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == sigma.shape
     whole = whole and lagged.ndim == 2 and len(lagged) == len(crept)
     if not whole or not all(np.isfinite(value).all() for value in values):
-        raise ValueError(f"{file}: its arrays do not fit together: what was held before is not known")
+        raise ValueError(f"{file}: its arrays do not fit together: earlier creep is not known")
     if 0.0 < now < float(time):
         raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
     return CreepRecord(float(time), creep_time, crept, sigma, lagged)
@@ -177,4 +177,4 @@ class CreepRecorder:
         try:
             write_record(file, record)
         except OSError as error:
-            self._warn(f"state_folder: {error}: the next start will not know of creep")
+            self._warn(f"state_folder: {error}: the next start will not know the creep so far")

@@ -60,7 +60,7 @@ class HysteresisTracker:
             if record is not None and time < record.time <= report.heard:
                 time = record.time  # the record is of this same shape, which was written before and is still held
             self.state = rested(self.law, report.signals, time, self._middle, record)
-            self.unknown = "it moved before this node followed it"
+            self.unknown = "the mirror moved before this node followed it"
             return
         if last.linked:
             self._seen = max(last.heard, self.state.time)
@@ -87,7 +87,7 @@ class HysteresisTracker:
         if not report.history_known:
             # Without a link it is not known whether the outputs held: the unit may have lost power.
             since = self._seen if report.linked and not last.linked else report.time
-            reason = "writes were lost, or a degauss was left, too short or too small"
+            reason = "writes were lost, or a degauss was interrupted, too short or too small"
             self._guess_keeping_creep(report, self.unknown or reason, since)
             return
         if (missed := report.turns - last.turns - 1) > 0:

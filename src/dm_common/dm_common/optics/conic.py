@@ -91,15 +91,18 @@ def pitch_of_sphere(
     """
     seen = float(np.asarray(coefficients)[DEFOCUS])
     if radius_of_curvature == 0.0 or not seen * radius_of_curvature > 0.0:
-        raise ValueError(f"a sphere of {radius_of_curvature:g} m, and the map shows {seen * 1e9:+.1f} nm of defocus")
+        raise ValueError(
+            f"radius of curvature = {radius_of_curvature:g} m: must have the sign of the map's defocus, "
+            f"{seen * 1e9:+.1f} nm"
+        )
     found = 2.0 * np.sqrt(seen * radius_of_curvature) / radius_px
     for _ in range(3):  # a sphere is a little steeper than the paraboloid of its curvature
         expected = conic_coefficients(1.0 / radius_of_curvature, 0.0, found * radius_px)[DEFOCUS]
         found *= np.sqrt(seen / expected)
     if pitch > 0.0 and not abs(found / pitch - 1.0) < 0.1:
         raise ValueError(
-            f"the map would have {found * 1e6:.3f} um per pixel, in use are {pitch * 1e6:.3f}: not a sphere of "
-            f"{radius_of_curvature:g} m"
+            f"the map would have {found * 1e6:.3f} um per pixel, the pitch in use is {pitch * 1e6:.3f} um: not a "
+            f"sphere of {radius_of_curvature:g} m"
         )
     return float(found), 0.5e-9 / abs(seen)
 

@@ -123,7 +123,7 @@ class BenchServices:
         if was_known and not self._history_known:
             raise Refusal(
                 ErrorCode.DRIVER_UNAVAILABLE,
-                "pdm_driver no longer knows what the actuators went through: it was restarted or lost its link",
+                "pdm_driver no longer knows the history of the actuators: it was restarted or lost its link",
             )
 
     def degauss(self, steps: int = 0) -> None:
@@ -232,7 +232,7 @@ class BenchServices:
             client = node.create_client(SetSignals, self._set_signals.service_name)  # of this namespace, as remapped
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
-                return "the mirror is left to pdm_driver, which ends too or does not answer"
+                return "the mirror was not brought back to mid range: pdm_driver ends too or does not answer"
             future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
             rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
             response = future.result() if future.done() else None
@@ -290,5 +290,5 @@ class BenchServices:
             if self.hold.lost is not None:
                 raise self.hold.lost
             if time.monotonic() > deadline or self.cancelled():
-                raise Refusal(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
+                raise Refusal(ErrorCode.PREEMPTED, "another program commanded the mirror meanwhile: stop it first")
             time.sleep(0.01)

@@ -59,6 +59,6 @@ def end() -> None:
     """End this process in as orderly a way as possible: the loop ends, the mirror is made safe."""
     signal.alarm(END_S)  # by the kernel, and first: the stuck thread may hold Python's lock, or that of the log
     get_logger("dm_common.ros").error(
-        "the middleware stands still (eProsima/Fast-DDS#6502): this node ends, and is to be started again"
+        "the middleware Fast DDS hangs (eProsima/Fast-DDS#6502): this node ends; start it again"
     )
     os.kill(os.getpid(), signal.SIGTERM)

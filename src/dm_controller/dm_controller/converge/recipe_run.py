@@ -73,8 +73,8 @@ class RecipeRun:
         if without:
             raise Refusal(
                 ErrorCode.NOT_SUPPORTED,
-                f"calibration {calibration.id} withholds recipes: {without.rstrip('.')}: `./dm calibrate` measures the "
-                "mirror as it is, `./dm check --forget` takes the actuators back",
+                f"calibration {calibration.id} withholds recipes: {without.rstrip('.')}: `./dm calibrate` measures "
+                "the mirror as it is, `./dm check --forget` uses the actuators again",
             )
         targets = recipe_targets(goal.curvatures, goal.conic_constant, goal.zernike, planner, options.reachable)
         steps = self._values["recipes.degauss_steps"]

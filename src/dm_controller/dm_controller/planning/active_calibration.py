@@ -23,7 +23,7 @@ from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
 #: Addition to the refusal while no calibration has been heard of, as in the first moments of the node.
-NOT_YET = "one that is in use already comes within seconds of this node's start"
+NOT_YET = "if one is in use, it arrives within seconds of this node's start"
 #: Warning where `hold_tilt` is true but the tilt cannot be held.
 NO_TILT = (
     "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
@@ -198,7 +198,8 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
     slope = slope_min(law, limits.low, limits.high).min()
     if not slope > 0.0:
         raise ValueError(
-            f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
+            f"hysteresis: play_weight: effective signals fall somewhere as the signal rises (slope {slope:.3g}): must "
+            "rise"
         )
     if law.actuators not in (0, calibration.actuators):
         raise ValueError(
@@ -208,8 +209,8 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
     furthest = spans[np.abs(spans - 1.0).argmax()]
     if not abs(furthest - 1.0) <= SPAN_TOLERANCE:
         raise ValueError(
-            f"hysteresis: play_weight: effective signals span {furthest:.3g} times what signals do: must be 1 +- "
-            f"{SPAN_TOLERANCE:g}, this is a law of another scale"
+            f"hysteresis: play_weight: effective signals span {furthest:.3g} times the range of the signals: must be "
+            f"1 +- {SPAN_TOLERANCE:g}; the law has another scale"
         )
     for name in ("held_out_max_zernike", "unknown_sigma"):
         value = getattr(hysteresis, name)

@@ -268,7 +268,7 @@ class Planner:
         largest_spread = self.error_bound(known, None if error is None else error - plan.max_zernike)
         most = ""
         if creep is not None and crept > MUCH * largest_spread:
-            held = "of what the mirror held before it was followed, which fades over hours"
+            held = "of shapes held before this node followed the mirror, which fades over hours"
             most = f"creep {held if creep.unseen else 'that the calibration leaves open'}"
         rms_lower, rms_upper = rms_bounds(plan.rms, rms_spread)
         return replace(

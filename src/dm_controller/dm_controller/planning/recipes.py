@@ -167,7 +167,10 @@ class Corrections:
         curvatures = [recipe.curvature for recipe in self._recipes]
         inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
         if inside.deviation(target, self._mirror.model.aperture_radius) > SAME_SHAPE:
-            raise RecipeError(f"curvature = {shape_text(target)}: nothing is extrapolated; there are {self._there()}")
+            raise RecipeError(
+                f"curvature = {shape_text(target)}: outside the recipes, which are not extrapolated; there are "
+                f"{self._there()}"
+            )
         weights, left = self._kriging.at(own)
         if left > LEFT_MAX:
             raise RecipeError(
@@ -239,7 +242,7 @@ def recipe_targets(
     radius = loop.mirror.model.aperture_radius
     for one, other in pairwise(targets):
         if one.deviation(other, radius) <= SAME_SHAPE:
-            raise RecipeError(f"curvatures: {shape_text(one)} is there twice; each recipe once")
+            raise RecipeError(f"curvatures: {shape_text(one)} is given twice: must be given once")
     for target in targets:
         left = loop.mirror.command(target)[1]
         if left > error_max:

@@ -86,9 +86,9 @@ class DegaussAction:
                 )
         if ended is not Outcome.REACHED:
             open_to_all = ended is Outcome.SUPERSEDED and not handle.request.holder
-            cure = "; hold_mirror keeps others off: give its holder to this goal" if open_to_all else ""
+            cure = "; hold_mirror keeps other commands away: give its holder in this goal" if open_to_all else ""
             return "abort", CODE_OF_OUTCOME[ended], ended.value + cure
-        too_little = f"; it takes the whole range and {DEGAUSS_STEPS_MIN} of them or more to make the history known"
+        too_little = f"; the history is known only after {DEGAUSS_STEPS_MIN} or more over the whole range"
         swings = f"{move.steps} half-swings in {time.monotonic() - began:.1f} s"
         return "succeed", ErrorCode.OK, swings if move.wipes else swings + too_little
 
@@ -107,8 +107,8 @@ class DegaussAction:
             superseded = move.wait(MARGIN_S) in (None, Outcome.SUPERSEDED)
             return "cancelled; the mirror follows a newer command" if superseded else ""
         if lost:
-            return f"cancelled; the mirror halts and is not slewed back, for it is somebody else's: {lost}"
+            return f"cancelled; the mirror stops where it is, since another program took it: {lost}"
         ended = back.wait(writer.ramp_time(back.target) + MARGIN_S)
         if ended is Outcome.REACHED:
             return "cancelled; the mirror is back in the shape it held before, its history is not known"
-        return f"cancelled; the way back to the shape held before: {ended.value if ended else 'not ended in time'}"
+        return f"cancelled; the return to the shape held before: {ended.value if ended else 'not ended in time'}"
