@@ -52,7 +52,10 @@ def test_what_is_no_length(text: str) -> None:
 @pytest.mark.parametrize("option", [("--until", "2nm"), ("--hysteresis", "100")])
 def test_maps_of_another_plan_are_no_hysteresis_run(option: tuple[str, str]) -> None:
     found = CliRunner().invoke(cli.app, ["calibrate", "--plan", "pokes", *option])
-    assert found.exit_code == 2 and f"--plan pokes and {option[0]}: must be the plan hysteresis" in found.output
+    assert (
+        found.exit_code == 2
+        and f"--plan pokes and {option[0]}: only the plan hysteresis has this option" in found.output
+    )
 
 
 @pytest.mark.parametrize("plan", [(), ("--plan", "surfaces")])
@@ -134,7 +137,7 @@ def test_a_bench_that_was_started_with_a_camera_keeps_it(tmp_path: Path) -> None
 def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:
     source = tmp_path / "other.yaml"
     shutil.copy(shared_config("bench.yaml"), source)
-    with pytest.raises(ConfigError, match=r"is of the mirror 'virtual-1', the nodes run 'T-7'"):
+    with pytest.raises(ConfigError, match=r"is for the mirror 'virtual-1', the nodes run 'T-7'"):
         source_of(tmp_path / "new.yaml", source, "T-7")
 
 
@@ -198,7 +201,7 @@ def test_what_was_reached_is_one_part_of_a_result_message() -> None:
     enough.reached = [5e-9, 3e-9]
     for found in (1e-9, 3e-9):
         sentence = enough.sentence(found)
-        assert "; " not in sentence and REACHED.search(sentence) and sentence.endswith("(part by part 5, 3 nm)")
+        assert "; " not in sentence and REACHED.search(sentence) and sentence.endswith("(after each part: 5, 3 nm)")
 
 
 class FakeClient:
@@ -212,7 +215,7 @@ class FakeClient:
 
     def calibrate(self, goal: Calibrate.Goal, show: Callable[[Any], None] = lambda _feedback: None) -> Calibrate.Result:
         if goal.dry_run:
-            return Calibrate.Result(message="110 maps in about 158 s, moves then right to 2.7 nm; nothing was moved")
+            return Calibrate.Result(message="110 maps in about 158 s, moves then accurate to 2.7 nm; nothing was moved")
         most, left = {"maps_left": 344, "time_left": 319.0}, {"maps_left": 40, "time_left": 60.0}
         left["expected_max_zernike"] = 2e-9
         for reached, rest in (
@@ -236,11 +239,12 @@ def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch
     monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(FakeClient(made)))
     done = CliRunner().invoke(cli.app, ["calibrate", "--until", "2nm"])
     lines = done.output.splitlines()
-    assert lines[0] == "expected: 110 maps in about 158 s, moves then right to 2.7 nm"
+    assert lines[0] == "expected: 110 maps in about 158 s, moves then accurate to 2.7 nm"
     assert [line for line in lines if "so far" in line] == [
-        "calibration: right to 11 nm so far, its law is hardly found yet: less with it, 344 more maps at most (319 s)",
-        "calibration: right to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
-        "calibration: right to 1.9 nm so far",
+        "calibration: accurate to 11 nm so far, the hysteresis law is hardly found yet and will reduce this, "
+        "344 more maps at most (319 s)",
+        "calibration: accurate to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
+        "calibration: accurate to 1.9 nm so far",
     ]
     said = [line for line in lines if ", step " in line]
     tenths = [9, 46, 91, 136, 181, 226, 272, 317, 362, 407]

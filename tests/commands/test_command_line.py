@@ -287,9 +287,11 @@ def test_who_holds_the_mirror_is_named() -> None:
 
 def test_the_status_says_what_the_controller_remarks_on_its_promise() -> None:
     able = Capabilities(curvature_min=-0.04, curvature_max=0.05, error_bound=2e-9, message="-0.04 to +0.05 1/m")
-    assert verb_status._promise(able).endswith("each move says its own")
+    assert verb_status._promise(able).endswith("each move states its own")
     able.message += "; without actuator 5; calibrated 40 days ago"
-    assert "each move says its own; [yellow]without actuator 5; calibrated 40 days ago[/]" in verb_status._promise(able)
+    assert "each move states its own; [yellow]without actuator 5; calibrated 40 days ago[/]" in verb_status._promise(
+        able
+    )
 
 
 def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:
@@ -300,7 +302,7 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
     assert "measured 1.32 nm: [red]outside" in verdict(1.27e-9, 1.32e-9)
     assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     state = FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True)
-    state.message = "right to 1.3 nm; most of that for creep"
+    state.message = "accurate to 1.3 nm; most of that for creep"
     _show(state, Calibration(wavelength=632.8e-9, instrument_error=4e-9, scale_error=1e-9, aperture_radius=0.011))
     said = capsys.readouterr().out
     assert "promised 1.3 nm (95 % bound)" in said and "0.00 nm" not in said
@@ -470,7 +472,7 @@ def test_status_says_where_only_of_what_is_absolute() -> None:
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
     said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))
-    assert said == "signals +0.00 to +0.00, not asked for as a curvature: without a bound"
+    assert said == "signals +0.00 to +0.00, no requested curvature and so without a bound"
 
 
 def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> None:

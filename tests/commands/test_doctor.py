@@ -128,8 +128,12 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("interferometer", {"reference_surface": str(FLAT), "wavelength.expected": 532e-9}, "must be 532.000 nm"),
     ("interferometer", {"zernike_topic": "/wavefront/zernike"}, "must be empty beside it"),
     ("interferometer", {"retrace": [0.0]}, "retrace: 1 numbers, must be 36 or none"),
-    ("interferometer", {"aperture.radius": 0.0, "aperture.follow": True}, "counts only with aperture.radius"),
-    ("interferometer", {"zernike_topic": "/zernike", **NO_FILES}, "is what this node itself publishes"),
+    ("interferometer", {"aperture.radius": 0.0, "aperture.follow": True}, "has an effect only with aperture.radius"),
+    (
+        "interferometer",
+        {"zernike_topic": "/zernike", **NO_FILES},
+        "must not be a topic that this node itself publishes",
+    ),
     ("interferometer", {"zernike_topic": "wave front", **NO_FILES}, "zernike_topic = 'wave front'"),
     ("interferometer", {"trigger_output_suffix": "../x"}, "must be an ending such as .datx"),
     ("pdm_driver", {"mirror.serial": " "}, "mirror.serial is empty"),
@@ -231,7 +235,7 @@ def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
     elsewhere = (
         *("must be one of", "must be {low} to {high}", "max_code", "must be finite", "leaves unconnected", "no camera"),
         *("path {", "px of an image", "must stay", "roi.x_offset"),
-        *("search.tolerance", "grey levels below 0"),  # of a mirror's range, and of images
+        *("search.tolerance", "negative grey levels"),  # of a mirror's range, and of images
     )
     missed = []
     for file in sorted({file for file, _ in reached if "/src/" in file}):
@@ -428,7 +432,7 @@ def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
     CalibrationStore(tmp_path).save(calibration)  # made now, of maps of 1970
     serial = calibration.mirror_serial
     foreign = doctor_bench.stored_calibration(tmp_path, "other", MONTH_S)
-    assert foreign is not None and f"those there are of {serial}" in foreign.problem
+    assert foreign is not None and f"it holds those of {serial}" in foreign.problem
     file, log = tmp_path / f"{calibration.id}.h5", tmp_path / f"{calibration.id}.checks.csv"
     check = Check(time.time(), 1, 1e-9, 1e-9, 1.0, 0.0, 1, 0.0)
     append_check(log, replace(check, accepted=0))

@@ -74,7 +74,7 @@ def test_a_direct_move_stands(page: Browser) -> None:
     page.picked("Direct").click()
     page.enter("Curvature, 1/m", "0.015")
     page.press("Move")
-    page.wait_for("Move: +0.0150 1/m stands after", 60)
+    page.wait_for("Move: +0.0150 1/m reached after", 60)
     assert "Mode: direct." in page.text
 
 
@@ -102,7 +102,7 @@ def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser, shots
     page.wait_for("coma sin +1 nm")
     page.press("Move")
     page.wait_for("Mode: conditioned.", 120)
-    page.wait_for("Move: +0.0150 1/m stands after", 120)
+    page.wait_for("Move: +0.0150 1/m reached after", 120)
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
     page.shoot(shots / "console.png")

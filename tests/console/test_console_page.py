@@ -138,7 +138,7 @@ def test_a_move_is_predicted_first_then_taken_and_measured(page: Browser, shots:
     page.wait_for("= +0.0401 dioptre")
     page.wait_for("Predicted residual")
     page.press("Move")
-    page.wait_for("Move: +0.0200 1/m stands after", 60)
+    page.wait_for("Move: +0.0200 1/m reached after", 60)
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
     page.wait_for("The map is of the present shape.")
@@ -204,7 +204,7 @@ def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Runn
     page.wait_for(": approximate", 60)
     page.enter("Curvature, 1/m", "0.01")
     page.press("Move")
-    page.wait_for("Move: +0.0100 1/m stands after", 60)
+    page.wait_for("Move: +0.0100 1/m reached after", 60)
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
 

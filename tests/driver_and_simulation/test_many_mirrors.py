@@ -51,7 +51,7 @@ def test_a_camera_comes_with_an_autofocus_that_knows_its_optics(tmp_path: Path) 
     assert parameters(config) is None
     assert config["virtual_bench"]["camera.rate"] > 0
     assert config["virtual_bench"]["camera.rest_distance"] == config["autofocus"]["optics.rest_distance"]
-    with pytest.raises(ValueError, match="--camera is for the virtual bench that ships"):
+    with pytest.raises(ValueError, match="--camera is for the shipped virtual bench only"):
         configurations([tmp_path / "config.yaml"], [""], camera=True)
 
 

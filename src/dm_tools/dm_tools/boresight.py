@@ -74,7 +74,7 @@ def run_boresight(
         lead = get_parameter(client, "autofocus", "stamp_lead")
         axis = np.array(get_parameter(client, "focus_controller", "optical_axis"))
         found, before, sigma = moved()
-        console.print(f"over the range the picture moves by {before:.2f} px (± {sigma:.2f})")
+        console.print(f"over the range of curvatures the picture moves by {before:.2f} px (± {sigma:.2f})")
         after = before
         if before > max(STILL_PX, 2 * sigma):
             held, axis = axis, axis + found.offset(client.capabilities.aperture_radius)
@@ -84,8 +84,8 @@ def run_boresight(
                 if after >= before:
                     raise DeformableMirrorError(
                         ErrorCode.NOT_CONVERGED,
-                        f"with another axis it moves by {after:.2f} px: does all that is in and near the region stand "
-                        "still, at one distance? The axis is as it was",
+                        f"with the axis that was found it moves by {after:.2f} px: is all in and near the region at "
+                        "rest, at one distance? The axis was not changed",
                     )
             except BaseException:  # Ctrl-C too: an axis that was not confirmed is not kept
                 set_parameter(client, "focus_controller", "optical_axis", held.tolist())
@@ -104,6 +104,6 @@ def run_boresight(
     if write is not None and source is not None:
         write_parameters(parameters, write, source, namespace, ("autofocus",))
     else:
-        console.print("in use until the node ends; for its next start (--write FILE does it) put into its file:")
+        console.print("in use until the node ends; to keep it, put into its parameter file (--write FILE does it):")
         console.print(parameters, markup=False, highlight=False)
     next_step("./dm focus 0.02", namespace)

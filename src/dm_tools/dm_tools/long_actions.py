@@ -124,12 +124,15 @@ def reached_so_far(feedback: Any) -> str:
     """Accuracy so far of a calibration that may end early, by its feedback, and what is left; "" = not known yet."""
     if not feedback.reached_max_zernike > 0.0:
         return ""
-    text = f"right to {in_nanometres(feedback.reached_max_zernike)} so far"
+    text = f"accurate to {in_nanometres(feedback.reached_max_zernike)} so far"
     if not feedback.maps_left:
         return text
     if not feedback.expected_max_zernike > 0.0:
         time = f"{feedback.time_left:.0f} s"
-        return f"{text}, its law is hardly found yet: less with it, {feedback.maps_left} more maps at most ({time})"
+        return (
+            f"{text}, the hysteresis law is hardly found yet and will reduce this, {feedback.maps_left} more maps at "
+            f"most ({time})"
+        )
     expected = in_nanometres(feedback.expected_max_zernike)
     return f"{text}, {expected} expected after {feedback.maps_left} more maps ({feedback.time_left:.0f} s)"
 

@@ -72,7 +72,7 @@ JsonOption = Annotated[
     ),
 ]
 TakeOverOption = Annotated[
-    bool, typer.Option("--take-over", help="Even if somebody else holds the mirror: their run ends.")
+    bool, typer.Option("--take-over", help="Take the mirror over from somebody else who holds it: their run ends.")
 ]
 
 

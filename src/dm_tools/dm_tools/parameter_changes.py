@@ -23,7 +23,7 @@ def set_parameter(client: Any, node: str, name: str, value: Any) -> None:
         reasons = "; ".join(each.reason for each in answer.results)
         from dm_client import DeformableMirrorError
 
-        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, f"the node `{node}` did not take {name}: {reasons}")
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, f"the node `{node}` did not accept {name}: {reasons}")
 
 
 def get_parameter(client: Any, node: str, name: str) -> Any:
@@ -63,7 +63,9 @@ def source_of(target: Path, config: Path | None, serial: str, namespace: str = "
     source = config or (target if target.is_file() else shared_config("bench.yaml"))
     written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
-        raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
+        raise ConfigError(
+            f"{source} is for the mirror {written!r}, the nodes run {serial!r}: give their file with --config"
+        )
     return source
 
 
@@ -83,7 +85,7 @@ def write_parameters(
         OSError: `source` cannot be read, or `target` cannot be written; an existing `target` is then unchanged.
     """
     if not parameters:
-        console.print(f"no parameter to change: {target} is not written, {source} holds")
+        console.print(f"no parameter to change: {source} is correct, {target} is not written")
         return
     camera = CAMERA if source == shared_config("bench.yaml") and "autofocus" in nodes else {}
     text = edited(edited(source.read_text(), camera), values_of(parameters), namespace)

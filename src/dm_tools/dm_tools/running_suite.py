@@ -26,7 +26,7 @@ MENTIONED = 0.5e-9
 
 #: Nodes without which there is no bench, and the effect when one is missing.
 NEEDED = {
-    "pdm_driver": "nothing can move, and what stands at the electronics is not known",
+    "pdm_driver": "nothing can move, and the signals at the electronics are not known",
     "interferometer": "no maps can be measured",
     "calibration": "no calibration can be made or loaded",
     "focus_controller": "no curvature can be asked for",

@@ -468,7 +468,7 @@ def test_the_loop_comes_back_with_its_law_and_its_doubt_follows() -> None:
     assert cards._loop_text.text.endswith("is a guess: moves were lost.") and cards._loop_picture._shown is not None
     settled = settled._replace(doubt="")
     cards.refresh(bench(message))
-    assert cards._loop_text.text.endswith("is where it stands.")
+    assert cards._loop_text.text.endswith("marks its present state.")
     observer.law = HysteresisModel.linear()
     cards.refresh(bench(message))
     assert cards._loop_picture._shown is None

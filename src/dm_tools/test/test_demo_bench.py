@@ -23,7 +23,7 @@ def test_a_demo_empties_its_own_folder_and_no_other(tmp_path: Path, monkeypatch:
     (mine / "thesis.tex").write_text("years")
     (tmp_path / "file").touch()
     for taken in (mine, tmp_path, tmp_path / "file"):
-        with pytest.raises(ValueError, match="is there, and not of a demo"):
+        with pytest.raises(ValueError, match="exists and is not of a demo"):
             usable_folder(taken)
     for folder in (made, empty):
         make_empty(usable_folder(folder))

@@ -40,7 +40,7 @@ async def move(session: Session, request: FocusRequest) -> str:
     """Move to the curvature of `request`."""
     result = await session.run("move_focus", MoveFocus.Goal(request=request))
     session.base = None
-    return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_text(result.state)}"
+    return f"{request.curvature:+.4f} 1/m reached after {result.duration:.2f} s. {prediction_text(result.state)}"
 
 
 async def converge(session: Session, request: FocusRequest) -> str:

@@ -116,7 +116,7 @@ class Session:
         name = self.ros.external_action
         if self.progress.title or not name:
             return self.progress
-        shown = Progress(EXTERNAL[name], text="no word of it yet", can_cancel=True)
+        shown = Progress(EXTERNAL[name], text="no feedback yet", can_cancel=True)
         if (feedback := self.ros.watched[name].feedback) is not None:
             shown.take(name, feedback)
         return shown

@@ -105,7 +105,7 @@ class StateObserver:
         if not own:
             return ActuatorEstimate(None, "focus_controller does not use this calibration")
         fitting = (estimate for estimate in reversed(own) if estimate.state is None or estimate.state.time <= time)
-        return next(fitting, ActuatorEstimate(None, "no estimate of the actuators is as old as this map"))
+        return next(fitting, ActuatorEstimate(None, "no estimate of the actuators from the time of this map"))
 
     def _settled(self, estimate: ActuatorEstimate, time: float) -> EffectiveSignals:
         state = estimate.state

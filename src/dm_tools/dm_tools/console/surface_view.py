@@ -10,8 +10,8 @@ from dm_tools.console.surfaces import Surface, SurfaceModel, difference, measure
 from dm_tools.verify import map_of
 
 NO_CALIBRATION = "No calibration is in use: nothing can be predicted."
-MOVED = "The mirror has moved since this map; all three are of the moment of the map."
-CREEP_BEFORE = "Creep of what was held before the focus controller followed it is not known."
+MOVED = "The mirror has moved since this map; all three show the moment of the map."
+CREEP_BEFORE = "Creep of shapes held before the focus controller followed the mirror is not known."
 #: Smaller changes of the effective signals do not count as a move: creep, and corrections that hold a shape against it.
 SMALL_MOVE = 2e-3
 #: The prediction is drawn again when an effective signal has changed by this much, normalised.

@@ -194,7 +194,7 @@ def prediction_text(state: Any) -> str:
         f"largest coefficient error below {state.predicted_max_zernike_upper * 1e9:.1f} nm"
     )
     if state.predicted_duration > 0:
-        text += f", shape stands after {state.predicted_duration:.2f} s"
+        text += f", shape reached after {state.predicted_duration:.2f} s"
     text += f". Mode: {MODES.get(state.mode, '?').lower()}."
     if state.saturated:
         text += f" Saturated: actuators {', '.join(map(str, state.saturated_actuators))}."
@@ -257,8 +257,8 @@ def calibration_text(calibration: Any) -> list[str]:
     law = calibration.hysteresis
     if law.play_radius:
         lines.append(
-            f"Hysteresis: {law.law}; creep {law.creep_rate:.2%} per decade; held-out "
-            f"moves to {law.held_out_max_zernike * 1e9:.2f} nm."
+            f"Hysteresis: {law.law}; creep {law.creep_rate:.2%} per decade; held-out moves accurate to "
+            f"{law.held_out_max_zernike * 1e9:.2f} nm."
         )
     if calibration.revision:
         lines.append(f"Maps that updated it since: {calibration.revision}.")

@@ -207,7 +207,7 @@ def demo(
             fitting_limit = best_possible(client.latest("calibration"), mirror, ends)
             if hysteresis_maps and (hysteresis is not Hysteresis.off or creep):
                 show_sweep(rows, fitting_limit, "influence function alone")
-                console.print("what an influence function cannot know is hysteresis and creep; now they are identified")
+                console.print("an influence function contains no hysteresis and creep; they are identified now")
                 identified = identify_hysteresis(client, hysteresis_maps, "demo, hysteresis")
                 wait_for_calibration(client, identified.id)
                 client.degauss()

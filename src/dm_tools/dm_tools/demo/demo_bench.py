@@ -114,8 +114,8 @@ def usable_folder(path: Path) -> Path:
     folder = path.resolve()
     if folder.exists() and not (folder.is_dir() and ((folder / MARK).is_file() or not any(folder.iterdir()))):
         raise ValueError(
-            f"--out {path}: is there, and not of a demo, which begins with an empty folder: name another, or delete it "
-            "(earlier versions left no mark)"
+            f"--out {path}: exists and is not of a demo, which would empty it: name another, or delete it (earlier "
+            "versions left no mark)"
         )
     return folder
 
@@ -146,7 +146,7 @@ def running_bench(config: dict[str, dict[str, Any]], logs: Path, domain: int, cl
 def wait_for_calibration(client: Any, identifier: str) -> None:
     """Wait until the focus controller uses a calibration. Raises RuntimeError if it does not."""
     if not client.wait(lambda: client.capabilities.calibration_id == identifier):
-        raise RuntimeError("the focus controller did not take the new calibration")
+        raise RuntimeError("the focus controller did not load the new calibration")
 
 
 def identify_hysteresis(client: Any, maps: int, note: str) -> Any:

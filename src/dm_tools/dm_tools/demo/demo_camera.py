@@ -105,7 +105,7 @@ def demo_camera(law: str, creep: float, seed: int, speed: float, out: Path, json
             approach = follow(camera, recorder, found[0].region)
     show(found, reach.curvature_tolerance)
     console.print(
-        f"focus stack of {len(sweep.shots)} images in {sweep.seconds:.1f} s; tracked what came nearer over "
+        f"focus stack of {len(sweep.shots)} images in {sweep.seconds:.1f} s; tracked an approaching object over "
         f"{len(approach.shots)} images"
     )
     title = f"autofocus through a simulated PDM30-37, hysteresis: {law}"

@@ -153,7 +153,9 @@ def one_record(config: Config) -> Finding | None:
     if len(set(folders.values())) < 2:
         return None
     told = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
-    return Finding(f"state_folder differs ({told}): maps would be compared with other creep", "give both the same")
+    return Finding(
+        f"state_folder differs ({told}): maps would be compared with another creep state", "give both nodes the same"
+    )
 
 
 def trigger_program(command: Sequence[str]) -> Finding | None:
@@ -181,7 +183,7 @@ def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
         return Finding(
             "; ".join(taken),
             "stop the ./dm up that is running, or the program that holds the port (ss -lntup shows it); or give the "
-            "virtual bench and what connects to it others in a parameter file",
+            "virtual bench and its clients other ports in a parameter file",
         )
     return None
 
@@ -227,10 +229,10 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
     damaged = [entry for entry in entries if entry.calibration is None]
     if damaged:
         remarks = "; ".join(entry.remark for entry in damaged)
-        return Finding(remarks, f"move what is named out of {folder}; restore it from your backup if you need it")
+        return Finding(remarks, f"move the named files out of {folder}; restore it from your backup if you need it")
     if not own:
         other = sorted({entry.calibration.mirror_serial for entry in entries if entry.calibration})
-        seen = f"; those there are of {', '.join(other)}" if other else ""
+        seen = f"; it holds those of {', '.join(other)}" if other else ""
         return Finding(
             f"no calibration of the mirror {serial} in {folder}{seen}", "./dm calibrate, once the nodes run", note=True
         )
@@ -242,7 +244,7 @@ def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding
     if days * DAY_S > stale_after:
         return Finding(
             f"no map has agreed with {used.id} for {days:.0f} days",
-            "./dm check says whether it is still true, and mends small drifts; else ./dm calibrate",
+            "./dm check says whether it still holds, and corrects small drifts; else ./dm calibrate",
             note=True,
         )
     return None

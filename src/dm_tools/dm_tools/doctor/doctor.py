@@ -20,7 +20,7 @@ def doctor(
 ) -> None:
     """Say what is wrong on this machine or bench, and how to cure it.
 
-    A note is worth knowing; only what is WRONG makes the exit status 1. Nothing is changed, no output is written to.
+    A note is for information; only what is WRONG makes the exit status 1. Nothing is changed or sent to outputs.
     """
     from dm_tools.doctor.bench import bench_checks
 
@@ -56,4 +56,4 @@ def held_by_the_nodes(check: str, finding: Finding | None, running: Finding | No
     held = PORTS if LINK_LOST in said else (*PORTS, *UNIT)
     if finding is None or not check.startswith(held) or "pdm_driver" not in said.partition("; not running")[0]:
         return finding
-    return finding._replace(cure="none, if that is for the nodes that run; ./dm status says how they are", note=True)
+    return finding._replace(cure="none, if the running nodes hold it; ./dm status shows their state", note=True)

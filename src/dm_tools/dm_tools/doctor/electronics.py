@@ -12,7 +12,7 @@ from dm_tools.doctor.machine import Check, Finding
 CURES = {
     "edac40_tcp": "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one "
     "client at a time: close the vendor's program, or stop the nodes that hold it",
-    "microscope": "start the device server of python-microscope; electronics.address is what it says then",
+    "microscope": "start the device server of python-microscope; it prints the value for electronics.address",
 }
 
 
@@ -61,7 +61,7 @@ def serial_port(device: Path) -> Finding | None:
     if not device.exists():
         return Finding(
             f"{device} does not exist",
-            "plug the unit in; `ls -l /dev/serial/by-id` shows what is there, under names that stay",
+            "plug the unit in; `ls -l /dev/serial/by-id` lists the units under names that stay the same",
         )
     if not os.access(device, os.R_OK | os.W_OK):
         group = _group(device)
@@ -72,7 +72,7 @@ def serial_port(device: Path) -> Finding | None:
     if users := holders([device.resolve()]):
         return Finding(
             f"{device} is in use by {', '.join(users)}",
-            "end that program: two writers on one unit tear each other's frames",
+            "end that program: two writers on one unit corrupt each other's frames",
             note=True,
         )
     return None

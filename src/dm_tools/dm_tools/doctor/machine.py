@@ -156,7 +156,7 @@ def running_nodes(namespace: str = "") -> Finding:
         twice = [name for name in count if count[name] > 1]
         if twice:
             return Finding(
-                f"{', '.join(twice)}: running more than once {place}; they answer and command over each other",
+                f"{', '.join(twice)}: running more than once {place}; both answer requests and command the mirror",
                 "end one of them, or give each mirror a --namespace or each bench a ROS_DOMAIN_ID of its own",
             )
         if count and (skew := _skew(client)) is not None:
@@ -231,8 +231,8 @@ def clock() -> Finding | None:
     installed = Path(__file__).stat().st_mtime
     if time.time() < installed:
         return Finding(
-            f"the system clock says {time.strftime('%Y-%m-%d', time.gmtime())}, but this program is of"
-            f" {time.strftime('%Y-%m-%d', time.gmtime(installed))}",
+            f"the system clock says {time.strftime('%Y-%m-%d', time.gmtime())}, but this program was installed on "
+            f"{time.strftime('%Y-%m-%d', time.gmtime(installed))}",
             "set the clock (timedatectl set-ntp true): time stamps of maps and commands depend on it",
         )
     program = shutil.which("timedatectl")

@@ -110,8 +110,8 @@ def _check_no_driver(node: Node, name: str) -> None:
         return
     if living := {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}:
         raise ValueError(
-            f"{name}: the node {living.pop()} publishes it here, and who follows that would take the recorded moves "
-            "for its own; replay with another ROS_DOMAIN_ID, or --topics without it"
+            f"{name}: the node {living.pop()} publishes it here, and its subscribers would take the recorded moves "
+            "for real ones; replay with another ROS_DOMAIN_ID, or --topics without it"
         )
 
 

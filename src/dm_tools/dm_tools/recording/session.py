@@ -131,8 +131,8 @@ def _decode(message: Message) -> Any:
         return deserialize_message(message.data, message_class(topic.type_name))
     except RuntimeError as error:  # of the middleware
         raise RecordingError(
-            f"{topic.name}: {topic.type_name} had another layout when it was recorded: a calibration is made again by "
-            "the version that recorded it only"
+            f"{topic.name}: {topic.type_name} had another layout when it was recorded: only the version that recorded "
+            "it can make the calibration again"
         ) from error
 
 

@@ -112,8 +112,8 @@ def show_result(result: Any, calibration: Any = None) -> None:
         expected = result.expected_max_zernike
         beforehand = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
         console.print(
-            f"promise: {promised}, from {in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out"
-            f"{beforehand}; hysteresis {result.hysteresis_model}"
+            f"promise: {promised}, from an error of {in_nanometres(result.hysteresis_held_out_max_zernike)} on moves "
+            f"held out{beforehand}; hysteresis {result.hysteresis_model}"
         )
     if calibration is not None:
         console.print(f"when flat: {two_fold(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
@@ -124,7 +124,7 @@ def show_result(result: Any, calibration: Any = None) -> None:
     for entry in result.poke_findings:
         console.print(f"[yellow]poke check[/] {entry}")
     if result.parameters:
-        console.print("poke check: to have it so, put into the parameter file (--write FILE does):")
+        console.print("poke check: to correct this, put into the parameter file (--write FILE does it):")
         console.print(result.parameters, markup=False, highlight=False)
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
@@ -156,7 +156,7 @@ def figures_of(result: Any) -> dict[str, Any]:
 
 def calibrate(
     plan: Annotated[
-        CalibrationPlan, typer.Option(help="What to measure; the others are for who knows why.")
+        CalibrationPlan, typer.Option(help="What to measure; the other plans are for special purposes.")
     ] = CalibrationPlan.hysteresis,
     surfaces: Annotated[
         str, typer.Option(help="Names from Table 1, comma separated, such as p01,pz02; empty = all.")
@@ -171,8 +171,8 @@ def calibrate(
     until: Annotated[
         str,
         typer.Option(
-            help="End a hysteresis run as soon as 95 % of moves are right to this, such as 2nm; --hysteresis is then "
-            "the most maps."
+            help="End a hysteresis run as soon as 95 % of moves are accurate to this, such as 2nm; --hysteresis is "
+            "then the largest number of maps."
         ),
     ] = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict duration and accuracy, move nothing.")] = False,
@@ -189,7 +189,10 @@ def calibrate(
         ),
     ] = False,
     region: Annotated[
-        str, typer.Option(help="With --boresight: left, top, width, height of what stands still, as shares.")
+        str,
+        typer.Option(
+            help="With --boresight: left, top, width, height of a part that stands still, as shares of the image."
+        ),
     ] = REGION,
     image_topic: Annotated[
         str, typer.Option(help="With --boresight: the camera's topic, as the node autofocus has it.")
@@ -221,11 +224,13 @@ def calibrate(
     from dm_client import DeformableMirrorError
 
     if config is not None and write is None:
-        raise typer.BadParameter("--config without --write: only that needs to know the file of the nodes")
+        raise typer.BadParameter("--config without --write: it is used only together with --write")
     if boresight:
         of_calibration = (dry_run, fresh, until, note, surfaces, amplitude, settle, hysteresis is not None)
         if any(of_calibration) or (plan, maps_per_state, activate) != (CalibrationPlan.hysteresis, 1, True):
-            raise typer.BadParameter("--boresight takes no option of a calibration: it moves the mirror, by images")
+            raise typer.BadParameter(
+                "--boresight takes no option of a calibration: it measures by images, and moves the mirror"
+            )
         from dm_tools.boresight import run_boresight
 
         run_boresight(namespace, region, image_topic, take_over, write, config, json)
@@ -234,7 +239,7 @@ def calibrate(
         raise typer.BadParameter("--region and --image-topic are for --boresight")
     if (hysteresis is not None or until) and plan != CalibrationPlan.hysteresis:
         option = "--until" if until else "--hysteresis"
-        raise typer.BadParameter(f"--plan {plan.value} and {option}: must be the plan hysteresis, which alone has that")
+        raise typer.BadParameter(f"--plan {plan.value} and {option}: only the plan hysteresis has this option")
     if amplitude and plan in (CalibrationPlan.hysteresis, CalibrationPlan.surfaces):
         raise typer.BadParameter(
             f"--plan {plan.value} and --amplitude: must be a plan with pokes, such as --plan pokes"

@@ -31,7 +31,7 @@ def check(
             metavar="NUMBER",
             min=1,
             max=65535,
-            help="Go on without this actuator, which does not move any more; repeatable. --forget takes it back.",
+            help="Continue without this actuator, which no longer moves; repeatable. --forget uses it again.",
         ),
     ] = None,
     take_over: TakeOverOption = False,
@@ -68,8 +68,8 @@ def check(
     else:
         if lost:
             console.print(
-                "[yellow]compared with where the actuators stand as the node `calibration` knows it, and not with the "
-                f"shape that was asked for: focus_controller does not know their history ({lost})[/]",
+                "[yellow]compared with the state of the actuators that the node `calibration` knows, and not with "
+                f"the shape requested: focus_controller does not know their history ({lost})[/]",
                 soft_wrap=True,
             )
         beyond = " beyond what is predicted" if shape is not None and shape.predicted >= MENTIONED else ""
@@ -81,8 +81,8 @@ def check(
             console.print(response.message, soft_wrap=True)
     maps = f"{response.revision} map{'' if response.revision == 1 else 's'}"
     console.print(
-        f"since the calibration was made: {maps} taken in, gains changed by up to {response.gain_drift:.2%}, the "
-        f"figure by {1e9 * response.offset_drift:.2f} nm rms"
+        f"since the calibration was made: {maps} used for updates, gains changed by up to {response.gain_drift:.2%}, "
+        f"the figure by {1e9 * response.offset_drift:.2f} nm rms"
     )
     names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
     write_json(json, {"check": figures(response, *names) | {"promised_nm": 1e9 * promised}})
@@ -95,9 +95,11 @@ def check(
         next_step(again, namespace)
         raise typer.Exit(1)
     if without:
-        again = "ask for the shape again: the command that stands counts on all actuators; ./dm status has the range"
+        again = (
+            "ask for the shape again: the present command still relies on all actuators; ./dm status shows the range"
+        )
         next_step(
-            "the same command, but for --dry-run, goes on so; nothing is changed yet" if dry_run else again, namespace
+            "the same command without --dry-run continues so; nothing is changed yet" if dry_run else again, namespace
         )
         return
     if lost and not forget:
@@ -106,6 +108,6 @@ def check(
     next_step(
         "./dm report writes what the calibration holds"
         if calibration.hysteresis.play_radius
-        else "./dm calibrate finds the hysteresis too, and promises far less than this",
+        else "./dm calibrate finds the hysteresis too; its error bound is far smaller than this",
         namespace,
     )

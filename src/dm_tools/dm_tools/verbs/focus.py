@@ -17,12 +17,12 @@ def focus(
     ] = False,
     conic: Annotated[float, typer.Option(help="Conic constant: 0 = sphere, -1 = paraboloid.")] = 0.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
-    wait: Annotated[bool, typer.Option(help="Return when the shape stands.")] = True,
+    wait: Annotated[bool, typer.Option(help="Return when the shape is reached.")] = True,
     take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
-    """Ask for a curvature: what is promised first, then the move."""
+    """Ask for a curvature: print the promised accuracy, then move."""
     from dm_client import DeformableMirrorError
 
     wanted = curvature / 2.0 if dioptre else curvature
@@ -33,7 +33,7 @@ def focus(
             if not dry_run and wait:
                 result = client.move_focus(wanted, conic, take_over=take_over)
                 state = result.state
-                console.print(f"the shape stands after {result.duration * 1e3:.0f} ms{_held(state)}")
+                console.print(f"the shape is reached after {result.duration * 1e3:.0f} ms{_held(state)}")
             elif not dry_run:
                 state = client.focus(wanted, conic, take_over=take_over)
         except DeformableMirrorError as error:
@@ -64,7 +64,7 @@ def flatten(
 def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     """Swing all actuators with falling amplitude: the mirror ends at mid range, with a known history.
 
-    It takes seconds. After it every promise is as narrow as the calibration allows.
+    It takes seconds. Afterwards error bounds are as small as the calibration allows.
     """
     with running_suite(namespace) as client, naming_holder(client):
         console.print("degaussing: the mirror swings over its whole range and ends at mid range")
@@ -105,9 +105,9 @@ def _show_next(state: Any, namespace: str) -> None:
     if not state.applied:
         next_step("the same without --dry-run moves the mirror")
     elif not state.history_known:
-        next_step("./dm degauss, then ask again: the promise is narrower", namespace)
+        next_step("./dm degauss, then ask again: the error bound is then smaller", namespace)
     else:
-        next_step("./dm check compares the promise with a map, ./dm status says where the mirror stands", namespace)
+        next_step("./dm check compares the promise with a map, ./dm status shows the present shape", namespace)
 
 
 def figures_of(state: Any) -> dict[str, Any]:

@@ -34,8 +34,8 @@ def instrument(
         Procedure,
         typer.Argument(
             help="flats: the reference surface, from a table of maps of flats (file, reference, part, degrees). "
-            "retrace: what goes with tilt, from maps of one shape under different tilts. grid: lateral scale and "
-            "distortion, from a table of marks (column, row, x, y; m) and a map with the same zoom."
+            "retrace: the errors that grow with tilt, from maps of one shape under different tilts. grid: lateral "
+            "scale and distortion, from a table of marks (column, row, x, y; m) and a map with the same zoom."
         ),
     ],
     files: Annotated[list[Path], typer.Argument(help="Tables (CSV with these headings), map files.")],
@@ -61,7 +61,7 @@ def instrument(
             raise MapRejectedError(f"{path}: {error}") from error
 
     if (write is not None) != (procedure is Procedure.FLATS):
-        raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
+        raise typer.BadParameter("--write FILE.fits: required for flats; the others write no file")
     wanted = {Procedure.FLATS: (1, "one table of maps"), Procedure.GRID: (2, "the table of marks and one map")}
     if procedure in wanted and len(files) != wanted[procedure][0]:
         raise typer.BadParameter(f"{len(files)} files: must be {wanted[procedure][1]}")
@@ -85,7 +85,7 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     rows = _table(table, "file", "reference", "part", "degrees")
     sources = [table.parent / row[0] for row in rows]
     if target.resolve() in [source.resolve() for source in (table, *sources)]:
-        raise ValueError(f"--write {target}: is read for this; give another file")
+        raise ValueError(f"--write {target}: is one of the files to read; give another")
     surfaces = [read(source) for source in sources]
     tolerance = WAVELENGTH_TOLERANCE * surfaces[0].wavelength
     for source, surface in zip(sources, surfaces, strict=True):
@@ -106,8 +106,8 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     if found.open_orders:
         orders = ", ".join(map(str, found.open_orders))
         console.print(
-            f"not told by these maps, and left out: angular orders {orders} (0 = what is the same all round); exchange "
-            "the flats, or turn one by an angle of no simple share of a turn",
+            f"not determined by these maps, and left out: angular orders {orders} (0 = rotationally symmetric); "
+            "exchange the flats, or turn one by an angle that is no simple fraction of a turn",
             soft_wrap=True,
         )
     # The bound is on coefficients up to this angular order, to which higher orders contribute nothing.
@@ -137,12 +137,12 @@ def _grid(table: Path, surface: Any) -> dict[str, Any]:
         raise ValueError(f"{table}: the marks give {found.pitch:g} m per pixel: x and y must be in m")
     if surface.pitch and abs(surface.pitch - found.pitch) > ZOOM_SHARE * found.pitch:  # the node would refuse every map
         raise ValueError(
-            f"{table}: the marks give {found.pitch * 1e6:.3f} um per pixel, the map tells {surface.pitch * 1e6:.3f}: "
-            "x and y must be in m, and the map of the same zoom"
+            f"{table}: the marks give {found.pitch * 1e6:.3f} um per pixel, the map states {surface.pitch * 1e6:.3f}: "
+            "x and y must be in m, and the zoom the same"
         )
     console.print(
-        f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks are "
-        f"{found.left * 1e6:.2f} um from where that puts them, rms",
+        f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks deviate from it "
+        f"by {found.left * 1e6:.2f} um rms",
         soft_wrap=True,
     )
     return {

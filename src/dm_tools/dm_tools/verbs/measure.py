@@ -12,12 +12,12 @@ from dm_tools.running_suite import running_suite
 
 
 def measure(
-    label: Annotated[str, typer.Option(help="Goes into the log.")] = "",
+    label: Annotated[str, typer.Option(help="Text for the log.")] = "",
     reference_sphere: Annotated[
         float | None,
         typer.Option(
             metavar="METRES",
-            help="In place of the mirror stands a sphere of this radius of curvature (negative = convex): find the "
+            help="A sphere of this radius of curvature (negative = convex) stands in place of the mirror: find the "
             "lateral scale from it.",
         ),
     ] = None,
@@ -46,7 +46,7 @@ def measure(
         f"largest coefficients beyond tilt: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
     )
     if found["curvature"] is not None:
-        console.print(f"defocus: as of a surface of {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
+        console.print(f"defocus: that of a surface with the curvature {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}", soft_wrap=True)
     then = "./dm check compares a map with the calibration in use"
     if reference_sphere is not None:
@@ -61,7 +61,7 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
     from dm_calibration.influence.poke_cure import parameter_text
 
     pitch, share = pitch_of_sphere(coefficients, info.aperture_radius_px, info.pitch, radius_of_curvature)
-    differs = f", {pitch / info.pitch - 1.0:+.3%} against what is in use" if info.pitch > 0.0 else ""
+    differs = f", {pitch / info.pitch - 1.0:+.3%} against the value in use" if info.pitch > 0.0 else ""
     console.print(
         f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it. "
         "Add half the relative error of the sphere's radius to scale_error",

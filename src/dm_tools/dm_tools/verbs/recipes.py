@@ -95,8 +95,8 @@ def recipes(
 ) -> None:
     """Build recipes on the bench: degauss, go, measure, correct, for each shape; stored with the calibration.
 
-    Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
-    at mid range.
+    Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps complete recipes and leaves the mirror at mid
+    range.
     """
     from dm_msgs.msg import RecipeBook
 

@@ -25,7 +25,7 @@ def record(
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
-    """Record the running suite until Ctrl-C; begin before a calibration that is to be made again from it.
+    """Record the running suite until Ctrl-C; start it before a calibration that is to be repeated from it.
 
     Writes a folder with one MCAP file and metadata.yaml, as `ros2 bag record -s mcap` does.
     """
@@ -59,7 +59,7 @@ def record(
     if not any(count for name, count in counts.items() if name not in of_others):
         shutil.rmtree(folder)
         if names and counts.get(PARAMETER_EVENTS):  # nodes of the suite have answered
-            raise RuntimeError("nothing was recorded: --topics names nothing that they publish")
+            raise RuntimeError("nothing was recorded: no topic in --topics is published")
         raise NotRunningError(
             "nothing was recorded: are the nodes running (./dm up), in this ROS_DOMAIN_ID and namespace?"
         )

@@ -31,7 +31,7 @@ def replay(
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
-    """Publish a recording's topics with their own timing, or make its calibration again, to the last bit."""
+    """Publish the topics of a recording with their timing, or repeat its calibration, to the last bit."""
     from dm_tools.recording.bag import BagReader
     from dm_tools.recording.player import play, replayed
 
@@ -39,7 +39,7 @@ def replay(
         raise typer.BadParameter(f"--rate {rate:g}: must be above 0")
     bag = BagReader(recording)
     for name in bag.unfinished:
-        console.print(f"[yellow]remark[/] {name} was not finished: what is whole in it is read")
+        console.print(f"[yellow]remark[/] {name} is incomplete: its complete part is read")
     if recalibrate:
         if rate != 1.0 or topics or commands:
             raise typer.BadParameter("--rate, --topics and --commands are for publishing, not for --recalibrate")

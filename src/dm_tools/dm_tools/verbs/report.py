@@ -82,15 +82,15 @@ def report(
     out: Annotated[Path, typer.Option(help="Folder for the two files.")] = Path("runs/report"),
     store: Annotated[Path | None, typer.Option(help="Folder of the calibration files; none = the usual ones.")] = None,
     operator: Annotated[
-        str, typer.Option(help="Who answers for the calibration; on the first page, kept for later.")
+        str, typer.Option(help="Who is responsible for the calibration; for the first page, kept for later.")
     ] = "",
-    instrument: Annotated[str, typer.Option(help="What measures; on the first page, kept for later.")] = "",
+    instrument: Annotated[str, typer.Option(help="The measuring instrument; for the first page, kept for later.")] = "",
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
     """Write the report of a calibration: what was measured with what, how good it is, and what limits it.
 
-    Reads the stored file; needs no running nodes, but goes by the parameters of those that run for that mirror.
+    Reads the stored file; needs no running nodes, but uses the parameters of those that run for that mirror.
     """
     from dm_calibration.calibration_parameters import JUDGED_BY
     from dm_calibration.report.certificate import keep_people, people

@@ -29,7 +29,7 @@ MISSING_S = 10.0
 
 
 def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
-    """Say on one screen what runs, where the mirror stands, what it promises, and what to do next."""
+    """Show on one screen what runs, the present shape and its error bound, and what to do next."""
     with running_suite(namespace) as client:
         times: list[int] = []
         health = hear_health(client, times)
@@ -91,7 +91,7 @@ def _now(by: str, shape: SettledShape | None, state: Any) -> str:
         return "nothing was commanded yet, or the driver is not heard"
     low, high = (round(signal, 2) + 0.0 for signal in (min(state.applied), max(state.applied)))  # no "-0.00"
     moving = ", moving" if state.moving else ""
-    return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature: without a bound{moving}"
+    return f"signals {low:+.2f} to {high:+.2f}, no requested curvature and so without a bound{moving}"
 
 
 def _calibration(calibration: Any, now: float = 0.0) -> str:
@@ -114,9 +114,9 @@ def _promise(capabilities: Any) -> str:
         return f"none now: {capabilities.message}"
     remarks = capabilities.message.partition("; ")[2]  # the part after the range
     return (
-        f"largest coefficient within {promise(capabilities.error_bound)} beyond what is predicted and what creep adds, "
-        f"from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move says its own"
-        f"{f'; [yellow]{remarks}[/]' if remarks else ''}"
+        f"largest coefficient error within {promise(capabilities.error_bound)} in addition to the predicted error and "
+        f"creep, from {range_text(capabilities.curvature_min, capabilities.curvature_max, '1/m')}; each move states "
+        f"its own{f'; [yellow]{remarks}[/]' if remarks else ''}"
     )
 
 

@@ -133,8 +133,8 @@ def only_suite(namespace: str) -> Iterator[None]:
         except OSError:
             place.seek(0)
             raise RuntimeError(
-                f"a suite runs already in the ROS domain {domain}, namespace /{namespace} ({place.read()}): "
-                "./dm status says how it is; Ctrl-C where it was started ends it. For several mirrors at once give one "
+                f"a suite runs already in the ROS domain {domain}, namespace /{namespace} ({place.read()}): ./dm "
+                "status shows its state; Ctrl-C where it was started ends it. For several mirrors at once give one "
                 "./dm up several --namespace"
             ) from None
         place.truncate(0)
@@ -155,7 +155,7 @@ def lacks(messages: Mapping[str, Any]) -> str:
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
         return "calibration and focus_controller have not said yet what the mirror can do"
     if messages["calibration"].id and not (capabilities.calibration_id or calibration_refused(capabilities)):
-        return "focus_controller has not taken the calibration yet"
+        return "focus_controller has not loaded the calibration yet"
     return ""
 
 
@@ -178,7 +178,7 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
         f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, {in_use}"
     )
     first = first_command(capabilities, file)
-    next_step(f"in another terminal: ./dm {first}; ./dm status says how things are", namespace)
+    next_step(f"in another terminal: ./dm {first}; ./dm status shows the state", namespace)
 
 
 def first_command(capabilities: Any, file: Path | None) -> str:
@@ -205,7 +205,9 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
     from dm_tools.doctor.bench import own_values
 
     if camera and files:
-        raise ValueError("--camera is for the virtual bench that ships; a file of yours says itself what camera it has")
+        raise ValueError(
+            "--camera is for the shipped virtual bench only; your own file says itself which camera it has"
+        )
     names = [namespace.strip("/") for namespace in namespaces]
     if len(set(names)) < len(names):
         raise ValueError(f"--namespace {', '.join(namespaces)}: each mirror needs one of its own")

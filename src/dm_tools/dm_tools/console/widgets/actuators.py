@@ -152,7 +152,9 @@ class ActuatorCards:
             fault = session.ros.observer.fault if calibration is not None else ""
             self._loop_text.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
             self._loop = ()
-            self._loop_picture.show(None, "No hysteresis was identified: the plan “Hysteresis” of a calibration does.")
+            self._loop_picture.show(
+                None, "No hysteresis was identified: a calibration with the plan “Hysteresis” does that."
+            )
             return
         settled = session.ros.observer.now(snapshot.bench_time)
         signal, stands = self._cells[session.chosen - 1].signal, None
@@ -166,5 +168,5 @@ class ActuatorCards:
         loop = measured or modelled_loop(law, session.chosen, mirror.signal_min, mirror.signal_max)
         loop = dataclasses.replace(loop, stands=stands)
         doubt = f" Its place in the loop is a guess: {settled.doubt}." if settled.doubt else ""
-        self._loop_text.show(f"Hysteresis as identified: {loop.text}; the cross is where it stands.{doubt}")
+        self._loop_text.show(f"Hysteresis as identified: {loop.text}; the cross marks its present state.{doubt}")
         self._loop_picture.show(loop_chart(loop))

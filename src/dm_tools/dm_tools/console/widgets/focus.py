@@ -110,9 +110,8 @@ class FocusCard:
         conditioned = capabilities.error_bound_conditioned
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
         self._text.show(
-            f"Reachable {curvatures_text(*found)}.\n"
-            "95 % bound on a coefficient beyond what is predicted and creep adds: "
-            f"{capabilities.error_bound * 1e9:.1f} nm{extra}."
+            f"Reachable {curvatures_text(*found)}.\n95 % bound on a coefficient error, in addition to the predicted "
+            f"error and creep: {capabilities.error_bound * 1e9:.1f} nm{extra}."
         )
         if found != self._range:
             self._range = found
