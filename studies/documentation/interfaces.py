@@ -40,8 +40,8 @@ Every field of a request or goal is checked before anything is done: NaN and inf
 numbers out of range with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters with
 INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME, texts with control characters other than tabs and
 line ends with INVALID_ARGUMENT; the sentence names field, value and what is allowed.
-Figures that were not worked out are NaN: those of a request refused before it was planned, or that a run did not come
-to. One refused for what was found out, a shape out of reach for example, tells what that was.
+Figures that were not computed are NaN, as in a request that was refused before planning or a run that ended early. A
+request refused because of its planned result, such as a shape out of reach, returns the figures of that result.
 
 A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
 `move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`
