@@ -38,7 +38,7 @@ WIDE_LEVELS_FROM = 250
 #: Share of the shapes that are held, and range of the times for which they are held, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
-#: One in so many of the moves that test the law is held.
+#: Of the moves that test the law at least one in so many is held.
 CHECK_HELD_EVERY = 8
 #: Random shapes per actuator after which the flat mirror is known; after these, one shape in IN_USE_EVERY is an in-use
 #: shape with random signals of amplitude SCATTER on top, as a share of half the range.
@@ -115,7 +115,8 @@ def _part(mirror: Mirror, maps: int, seed: int, random: int, *, wide: bool) -> E
     in_use = check | ((number >= random) & (number % IN_USE_EVERY == 0))
     shapes[in_use & ~check] = _as_in_use(mirror, int((in_use & ~check).sum()), SCATTER, rng, one_way=True)
     held = rng.random(maps) < HELD_SHARE
-    held[check] = np.arange(checks) % CHECK_HELD_EVERY == CHECK_HELD_EVERY // 2
+    if held[check].sum() < checks // CHECK_HELD_EVERY:
+        held[check] = np.arange(checks) % CHECK_HELD_EVERY == CHECK_HELD_EVERY // 2
     shapes[held & ~in_use] = _bowls(mirror, shapes[held & ~in_use])
     low, high = np.log(HELD_S)
     dwell = np.where(held, np.exp(rng.uniform(low, high, maps)), 0.0)
