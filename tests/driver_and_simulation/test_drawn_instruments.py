@@ -15,7 +15,7 @@ import pytest
 from dm_calibration.acquisition.ingest import Ingest
 from dm_calibration.interferometer_parameters import load_reference
 from dm_calibration.map_files import SurfaceMap
-from dm_common.figures import two_fold
+from dm_common.figures import accuracy_text
 from dm_common.optics.zernike import PISTON_TILT
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.zygo_files import encode_dat
@@ -156,6 +156,6 @@ def test_what_is_left_is_inside_the_absolute_bound(seed: int, tmp_path: Path) ->
     left, before = (np.abs(apart.mean(axis=0)).max() for apart in (corrected, plain))
     repeatable = 2.0 * corrected.std(axis=0, ddof=1).max() / np.sqrt(AVERAGED)
     calibration = SimpleNamespace(wavelength=632.8e-9, aperture_radius=SETTINGS.aperture_radius, **bounds)
-    text = two_fold(float(repeatable), calibration, 2.0 * power / RADIUS**2)
+    text = accuracy_text(float(repeatable), calibration, 2.0 * power / RADIUS**2)
     told = re.search(r"absolute to ([\d.]+) nm", text)
     assert told and left < 1e-9 * float(told[1]) < before > 4.0 * left, (left, before, text)

@@ -166,7 +166,7 @@ def test_a_curved_response_is_found_and_inverted_without_hysteresis(spread: floa
     wanted = rng.uniform(-0.6, 0.6, 7)
     inverted = invert(law, state, law.position_at(state, wanted), -1.0, 1.0)
     np.testing.assert_allclose(inverted.signals, wanted, atol=1e-6)
-    np.testing.assert_array_equal(inverted.missed, 0.0)
+    np.testing.assert_array_equal(inverted.residual, 0.0)
 
 
 def test_maps_without_data_change_little() -> None:

@@ -25,7 +25,7 @@ from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService
-from dm_common.values import Fields, real, without_figures
+from dm_common.values import Fields, fill_with_nan, real
 
 SET_FOCUS_DISTANCE = Fields(
     {"distance": real(0.0, 0.0, math.inf, "m", infinite=True), "dioptre": real(0.0, unit="1/m")}
@@ -65,7 +65,7 @@ class AutofocusNode(ManagedNode):
     def _on_set_focus_distance(
         self, request: SetFocusDistance.Request, response: SetFocusDistance.Response
     ) -> SetFocusDistance.Response:
-        without_figures(response)  # until they are known
+        fill_with_nan(response)  # until they are known
         if request.distance != 0 and request.dioptre != 0:
             raise Refusal(
                 ErrorCode.INVALID_ARGUMENT,

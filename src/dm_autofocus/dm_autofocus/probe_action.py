@@ -14,7 +14,7 @@ from dm_autofocus.search.peak_search import Phase
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.optics.conic import range_text
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
-from dm_common.values import Fields, real, text, without_figures
+from dm_common.values import Fields, fill_with_nan, real, text
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
@@ -113,7 +113,7 @@ class ProbeAction(ABC):
 
     def _run(self, goal_handle: WorkerGoal) -> tuple[str, Any]:
         started = time.monotonic()
-        result = without_figures(self.action_type.Result())  # until they are known
+        result = fill_with_nan(self.action_type.Result())  # until they are known
         outcome = "succeed"
 
         def check() -> None:

@@ -16,7 +16,7 @@ from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteres
 from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import in_nanometres
-from dm_common.hysteresis.model import IN_USE
+from dm_common.hysteresis.model import REQUEST_ERROR_RATIO
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
@@ -93,7 +93,7 @@ class Calibration:
     def promise(self) -> float:
         """95 % bound on the largest coefficient error of a request, m, from maps that were not used in the fit."""
         found = self.hysteresis
-        error = self.fit.held_out_max_zernike if found is None else IN_USE * found.held_out_max_zernike
+        error = self.fit.held_out_max_zernike if found is None else REQUEST_ERROR_RATIO * found.held_out_max_zernike
         return float(error)
 
     def doubts(self, error_max: float = CALIBRATED_ERROR_MAX) -> list[str]:

@@ -24,7 +24,7 @@ from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, lasting, wait_for_clock
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 
 _OF_HYSTERESIS = (StepKind.EXCITATION, StepKind.IN_USE, StepKind.CHECK, StepKind.DEGAUSSED)
 _PHASES = {StepKind.POKE: "pokes", StepKind.SURFACE: "surfaces"} | dict.fromkeys(_OF_HYSTERESIS, "hysteresis")
@@ -47,7 +47,7 @@ class CalibrateAction:
         self._node, self._values, self._services, self._manager = node, values, services, manager
         self._handle, self._goal = handle, handle.request
         self._maps_per_state = self._goal.maps_per_state or 1
-        self._result = without_figures(Calibrate.Result())
+        self._result = fill_with_nan(Calibrate.Result())
         self._feedback, self._end = Calibrate.Feedback(), 0
 
     def run(self) -> tuple[str, Calibrate.Result]:

@@ -47,7 +47,7 @@ INGEST_FILE = Fields({"path": text("")})
 class InterferometerNode(ManagedNode):
     """Converts between map files and messages; reading and fitting are in `ingest` and `acquisition`."""
 
-    rests = False
+    requires_activation = False
 
     def __init__(self) -> None:
         self._mirror_radius = 0.0  # m; 0 = not known

@@ -38,7 +38,7 @@ from dm_calibration.report.html_page import html_page
 from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.hysteresis.model import IN_USE, HysteresisModel
+from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel
 from dm_common.optics.conic import conic_coefficients, range_text
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import edge_clustered_points
@@ -235,7 +235,7 @@ def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[C
 
 
 def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibration, tmp_path: Path) -> None:
-    held_out = 5e-9 / IN_USE
+    held_out = 5e-9 / REQUEST_ERROR_RATIO
     known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), held_out, 0.05, 120, ()))
     start = known.stamp_ns * 1e-9
     # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.

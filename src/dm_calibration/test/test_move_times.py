@@ -9,7 +9,7 @@ import pytest
 
 from dm_calibration.hysteresis.features import crept, follow, play_features
 from dm_calibration.influence.maps import BEFORE_FIRST_MAP_S, MapSet
-from dm_common.hysteresis.law_shape import certain_limits
+from dm_common.hysteresis.law_shape import worst_case_limits
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
@@ -57,9 +57,9 @@ def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
 
 
 def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -> None:
-    linear = certain_limits(HysteresisModel.linear(), Limits(-1.0, 0.5))
+    linear = worst_case_limits(HysteresisModel.linear(), Limits(-1.0, 0.5))
     assert (linear.low, linear.high) == pytest.approx((-1.0, 0.5))
-    certain = certain_limits(LAW, Limits())
+    certain = worst_case_limits(LAW, Limits())
     low, high = certain.low, certain.high
     assert -1.0 < low < -0.85 and 0.85 < high < 1.0
     rng = np.random.default_rng(7)

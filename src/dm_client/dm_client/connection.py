@@ -213,10 +213,10 @@ class Connection:
         A node that has just started may lose a request: with `again`, for requests that may be carried out twice, it is
         sent once more if no answer comes within the client's `timeout_s`.
         """
-        with self._answered(name, ActionClient) as gone:
+        with self._answered(name, ActionClient) as lost_reason:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
             again_s = self._timeout_s if again else math.inf
-            response = call(self.clients[name], request, timeout_s, gone, again_s, ready_s=self._timeout_s)
+            response = call(self.clients[name], request, timeout_s, lost_reason, again_s, ready_s=self._timeout_s)
         return checked(response)
 
     def run_action(
@@ -244,7 +244,7 @@ class Connection:
                 failed.append(error)
 
         try:
-            with self._answered(name, Client) as gone:
+            with self._answered(name, Client) as lost_reason:
                 result = run_goal(
                     self.clients[name],
                     goal,
@@ -252,7 +252,7 @@ class Connection:
                     answer_s=self._timeout_s,
                     on_feedback=take,
                     stop=lambda: bool(failed) or stop(),
-                    gone=gone,
+                    server_lost=lost_reason,
                     identity=identity,
                 )
         finally:
@@ -278,11 +278,11 @@ class Connection:
         server.wait_for_return()
         lost = server.since_now()
 
-        def gone() -> str:
+        def lost_reason() -> str:
             return self._over() or lost()
 
         try:
-            yield gone
+            yield lost_reason
         except Exception as error:
             if over := self._over():  # whatever rclpy reports of destroyed objects
                 raise DeformableMirrorError(ErrorCode.CANCELED, f"{name}: {over}") from error

@@ -14,14 +14,14 @@ def in_nanometres(length: float) -> str:
     return f"{rounded(length * 1e9)} nm"
 
 
-def told_from(length: float, other: float) -> str:
+def distinct_from(length: float, other: float) -> str:
     """A length (m) with two digits, or as many as distinguish it from `other` (m), such as 2.04 nm."""
-    text, beside = in_nanometres(length), in_nanometres(other)
+    text, other_text = in_nanometres(length), in_nanometres(other)
     for digits in (3, 4, 5):
-        if text != beside or length >= 1e-6:
+        if text != other_text or length >= 1e-6:
             return text
-        text, beside = (f"{value * 1e9:.{digits}g} nm" for value in (length, other))
-    return text if text != beside else in_nanometres(length)
+        text, other_text = (f"{value * 1e9:.{digits}g} nm" for value in (length, other))
+    return text if text != other_text else in_nanometres(length)
 
 
 def in_wavelengths(length: float, wavelength: float) -> str:
@@ -35,7 +35,7 @@ def with_wavelengths(text: str, length: float, wavelength: float) -> str:
     return f"{text} ({share})" if share else text
 
 
-def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
+def accuracy_text(repeatable: float, calibration: Any, curvature: float) -> str:
     """Text on the repeatability and the absolute accuracy of open-loop moves, and on the limit of the latter.
 
     Args:

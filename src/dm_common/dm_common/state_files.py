@@ -15,9 +15,9 @@ def ros_home(place: str = "") -> Path:
 
 def file_stem(*names: object) -> str:
     """A file name made of `names`; if characters must be replaced, digits of their SHA-256 keep it unique."""
-    told = "_".join(map(str, names))
+    joined = "_".join(map(str, names))
     stem = "_".join(re.sub(r"[^A-Za-z0-9._-]+", "-", str(name)).strip("-.") for name in names)[:200] or "mirror"
-    return stem if stem == told else f"{stem}-{hashlib.sha256(told.encode()).hexdigest()[:8]}"
+    return stem if stem == joined else f"{stem}-{hashlib.sha256(joined.encode()).hexdigest()[:8]}"
 
 
 def state_file(folder: str, suffix: str, *names: object) -> Path | None:

@@ -170,11 +170,11 @@ class Fields:
             value.check(name, get(message))
 
 
-def without_figures(message: Any) -> Any:
+def fill_with_nan(message: Any) -> Any:
     """Set all floats of `message`, nested ones too, to NaN: after a refusal none is known, and 0 would be a value."""
     for name, kind in message.get_fields_and_field_types().items():
         if kind == "double":
             setattr(message, name, math.nan)
         elif "/" in kind and not kind.startswith("sequence"):
-            without_figures(getattr(message, name))
+            fill_with_nan(getattr(message, name))
     return message

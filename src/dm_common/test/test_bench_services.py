@@ -93,7 +93,7 @@ def test_a_map_takes_as_long_when_the_clock_is_set_meanwhile(
     node.create_service(Measure, "measure", answer)
     bench = BenchServices(node, {"settle_time": 0.0, "measure_timeout": 60.0})
     monkeypatch.setattr(node, "get_clock", lambda: SimpleNamespace(now=now, ros_time_is_active=simulated))
-    bench.measure_as_it_stands("rest")
+    bench.measure_present_shape("rest")
     assert shifts[-1] == step_s and 0.0 <= bench.map_time < 60.0
 
 

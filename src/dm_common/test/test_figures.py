@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dm_common.figures import in_nanometres, in_wavelengths, told_from, two_fold
+from dm_common.figures import accuracy_text, distinct_from, in_nanometres, in_wavelengths
 from dm_common.optics.conic import range_text
 
 
@@ -36,7 +36,7 @@ def test_a_length_in_nanometres_and_by_the_wavelength(length: float, nanometres:
     ],
 )
 def test_a_length_is_told_from_the_one_beside_it(length: float, other: float, text: str) -> None:
-    assert told_from(length, other) == text
+    assert distinct_from(length, other) == text
 
 
 @pytest.mark.parametrize(
@@ -82,4 +82,4 @@ def test_a_range_is_rounded_inwards(low: float, high: float, text: str) -> None:
 def test_a_bound_is_put_twice(repeatable: float, instrument: float, scale: float, text: str) -> None:
     instrument_of = {"instrument_error": instrument, "scale_error": scale}
     calibration = SimpleNamespace(wavelength=632.8e-9, aperture_radius=11e-3, **instrument_of)
-    assert two_fold(repeatable, calibration, -0.05) == text
+    assert accuracy_text(repeatable, calibration, -0.05) == text

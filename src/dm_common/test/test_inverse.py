@@ -32,7 +32,7 @@ def test_the_law_of_the_inverse_is_what_was_wanted(law: HysteresisModel, turns: 
         found = invert(law, state, np.array(wanted), -1.0, 1.0, ahead)
         reached = law.advance(law.move(state, found.signals, state.time), state.time + ahead)
         np.testing.assert_allclose(law.effective(reached), wanted, atol=atol)
-        np.testing.assert_array_equal(found.missed, 0.0)
+        np.testing.assert_array_equal(found.residual, 0.0)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -41,14 +41,14 @@ def test_a_limit_stops_it_and_tells_what_is_missed(law: HysteresisModel) -> None
     found = invert(law, state, np.array([5.0, -5.0, 0.1]), -0.5, 0.6)
     np.testing.assert_allclose(found.signals[:2], [0.6, -0.5])
     reached = law.effective(law.move(state, found.signals, 0.0))
-    np.testing.assert_allclose(found.missed, [5.0 - reached[0], -5.0 - reached[1], 0.0], atol=1e-7)
+    np.testing.assert_allclose(found.residual, [5.0 - reached[0], -5.0 - reached[1], 0.0], atol=1e-7)
 
 
 def test_without_hysteresis_signals_are_effective_signals() -> None:
     law = HysteresisModel.linear()
     found = invert(law, law.demagnetised(2, 0.0), np.array([0.3, 1.4]), -1.0, 1.0)
     np.testing.assert_allclose(found.signals, [0.3, 1.0])
-    np.testing.assert_allclose(found.missed, [0.0, 0.4])
+    np.testing.assert_allclose(found.residual, [0.0, 0.4])
 
 
 @pytest.mark.parametrize("wanted", [np.zeros(2), np.array([0.0, np.nan, 0.0])])

@@ -58,9 +58,9 @@ def watched(time: Time) -> Watched:
 
 
 def test_a_node_that_comes_at_last_is_what_was_waited_for(watched: Watched) -> None:
-    gone = watched.since_now()
+    lost_reason = watched.since_now()
     watched.change(1, 0)
-    assert gone() == "" and not watched.lost
+    assert lost_reason() == "" and not watched.lost
 
 
 def test_a_dead_node_is_missing_within_two_seconds_and_a_stall_is_forgiven(watched: Watched, time: Time) -> None:
@@ -94,8 +94,8 @@ def test_a_call_waits_for_a_node_that_others_know_to_be_back(watched: Watched, t
     time.now += 10.0
     time.at[110.5] = lambda: watched.change(1, 0)
     watched.wait_for_return()
-    gone = watched.since_now()
-    assert gone() == "" and time.now >= 110.5
+    lost_reason = watched.since_now()
+    assert lost_reason() == "" and time.now >= 110.5
     watched.change(-1, 1)
     began = time.now = 120.0
     watched.wait_for_return()
@@ -105,22 +105,22 @@ def test_a_call_waits_for_a_node_that_others_know_to_be_back(watched: Watched, t
 @pytest.mark.parametrize("lapsed_before", [False, True])
 def test_a_node_that_was_started_anew_within_its_lease_counts_as_gone(watched: Watched, lapsed_before: bool) -> None:
     watched.change(1, 0)
-    gone = watched.since_now()
+    lost_reason = watched.since_now()
     if lapsed_before:
         watched.change(-1, 1)
     watched.change(1, 0)
     assert not watched.missing()
-    assert gone() == "the node pdm_driver was restarted meanwhile: ask again"
+    assert lost_reason() == "the node pdm_driver was restarted meanwhile: ask again"
     assert watched.since_now()() == ""
 
 
 def test_a_lease_that_lapses_on_a_busy_machine_is_no_new_start(watched: Watched) -> None:
     watched.change(1, 0)
-    gone = watched.since_now()
+    lost_reason = watched.since_now()
     watched.change(-1, 1)
     assert watched.lost
     watched.change(1, -1)
-    assert not watched.lost and gone() == ""
+    assert not watched.lost and lost_reason() == ""
 
 
 def test_a_node_whose_coming_was_not_heard_of_has_died_all_the_same(watched: Watched) -> None:
@@ -128,9 +128,9 @@ def test_a_node_whose_coming_was_not_heard_of_has_died_all_the_same(watched: Wat
     watched.alive = 1
     watched.change(-1, 1)
     assert watched.lost and watched.text.startswith("the node pdm_driver has died")
-    gone = watched.since_now()
+    lost_reason = watched.since_now()
     watched.change(1, 0)
-    assert gone() == "the node pdm_driver was restarted meanwhile: ask again"
+    assert lost_reason() == "the node pdm_driver was restarted meanwhile: ask again"
 
 
 def test_a_process_watches_a_topic_once() -> None:

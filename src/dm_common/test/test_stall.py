@@ -26,7 +26,7 @@ class Careful(Node):
         print("safe", flush=True)
 
 looks = iter(range(8))
-stall.LOOK_S, stall.END_S, stall.wakes = 0.02, 1, lambda _tasks: {"1": next(looks, 7)}
+stall.CHECK_S, stall.END_S, stall.wakes = 0.02, 1, lambda _tasks: {"1": next(looks, 7)}
 executor.rclpy.try_shutdown = lambda: time.sleep(100.0)
 sys.exit(executor.run_node(Careful))
 """
@@ -51,15 +51,15 @@ def test_threads_that_wake_do_not_count_as_stuck(monkeypatch: pytest.MonkeyPatch
     task(2, "dds.ev.0", 8)
     task(3, "dds.ev.1", 8)
     assert stall.wakes(tmp_path) == {"2": 8, "3": 8}
-    looks, ended, real = [0], list[int](), stall.wakes
+    checks, ended, real = [0], list[int](), stall.wakes
 
     def wakes(_tasks: Path) -> dict[str, int]:
-        looks[0] += 1
-        return {"2": looks[0], "3": min(looks[0], 20)}
+        checks[0] += 1
+        return {"2": checks[0], "3": min(checks[0], 20)}
 
     monkeypatch.setattr(stall, "wakes", wakes)
-    stall._watch(0.0, lambda: ended.append(looks[0]), tmp_path)
-    assert ended == [20 + stall.LOOKS]
+    stall._watch(0.0, lambda: ended.append(checks[0]), tmp_path)
+    assert ended == [20 + stall.CHECKS]
     assert not real(tmp_path / "none"), "no such system"
     # A count that never changes tells nothing.
     counts = iter([{"2": 5}] * 100 + [{}])
@@ -76,9 +76,9 @@ def test_a_node_that_lives_wakes_up(domain: int, tmp_path: Path) -> None:
         "rclpy.init()\n"
         "node = rclpy.create_node('living')\n"
         "before = stall.wakes()\n"
-        "time.sleep(stall.LOOK_S)\n"
+        "time.sleep(stall.CHECK_S)\n"
         "assert before and all(count > before[thread] for thread, count in stall.wakes().items())\n"
     )
     began = time.monotonic()
     subprocess.run([sys.executable, str(script)], check=True, timeout=30)
-    assert time.monotonic() - began > stall.LOOK_S
+    assert time.monotonic() - began > stall.CHECK_S

@@ -10,7 +10,7 @@ import pytest
 from dm_msgs.msg import FocusState
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.values import TEXT_MAX, Fields, real, reals, text, texts, whole, without_figures
+from dm_common.values import TEXT_MAX, Fields, fill_with_nan, real, reals, text, texts, whole
 
 FIELDS = Fields(
     {
@@ -79,6 +79,6 @@ def test_wrong_values_are_named_with_what_is_allowed(changed: dict[str, Any], co
 
 
 def test_a_refused_message_holds_no_figures_that_look_like_values() -> None:
-    state = without_figures(FocusState(mode="direct"))
+    state = fill_with_nan(FocusState(mode="direct"))
     assert math.isnan(state.predicted_rms) and math.isnan(state.curvature_min)
     assert state.mode == "direct" and state.header.stamp.sec == 0 and not state.signals

@@ -20,7 +20,7 @@ from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import health
@@ -155,7 +155,7 @@ class MoveFocusAction:
                 raise refusal
 
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
-        started, result = time.monotonic(), without_figures(MoveFocus.Result())
+        started, result = time.monotonic(), fill_with_nan(MoveFocus.Result())
         try:
             outcome, result.error_code, result.message = self._carry_out(handle, result)
         except ClockError as error:

@@ -139,7 +139,7 @@ class FocusControllerNode(FocusHost):
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
-            gone = f"pdm_driver {qos.GONE}" if self._driver.missing() else ""
+            gone = f"pdm_driver {qos.LOST_TEXT}" if self._driver.missing() else ""
             self.carry_out(controller.tick(now, gone), now)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
 

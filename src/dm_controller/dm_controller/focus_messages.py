@@ -12,7 +12,7 @@ from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
 from dm_common.optics.conic import curvatures_text
 from dm_common.ros.lifecycle import OK, WARN, Health
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_types import Moment, Order
 from dm_controller.forecast import HysteresisShare
@@ -30,7 +30,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
     `share` is the contribution of hysteresis where the calibration has no model of it; None = not known.
     """
     request, move, active, refusal = order.request, order.move, order.active, order.refusal
-    state = without_figures(FocusState()) if move is None else FocusState()
+    state = fill_with_nan(FocusState()) if move is None else FocusState()
     state.curvature, state.power = request.curvature, 2 * request.curvature
     state.conic_constant = request.conic_constant
     state.mode, state.applied = request.mode, order.applied

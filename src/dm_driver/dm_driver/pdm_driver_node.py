@@ -21,7 +21,7 @@ from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerService, never_silent
 from dm_common.state_files import state_file
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
 from dm_driver.commands.degauss_action import DegaussAction
@@ -40,7 +40,7 @@ STATE_INTERVAL_S = 0.02
 class PdmDriverNode(ManagedNode):
     """The node; see the head of this module."""
 
-    rests = False
+    requires_activation = False
 
     def __init__(self) -> None:
         super().__init__("pdm_driver", PARAMETERS)
@@ -172,7 +172,7 @@ class PdmDriverNode(ManagedNode):
         self._gate.attempt("actuator_command", message, carry_out)
 
     def _on_set_signals(self, request: Any, response: Any) -> Any:
-        without_figures(response)  # until they are known
+        fill_with_nan(response)  # until they are known
 
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
             target = configuration.limiter.check_shape(request.signals)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
-from dm_common.figures import in_nanometres, told_from
+from dm_common.figures import distinct_from, in_nanometres
 from dm_tools.output import NotRunningError, errors
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def promise(bound: float) -> str:
 
 def promise_of(calibration: Any) -> float:
     """95 % bound on the largest coefficient error of a request without creep, m, from a calibration's message."""
-    from dm_common.hysteresis.model import IN_USE
+    from dm_common.hysteresis.model import REQUEST_ERROR_RATIO
     from dm_common.messages import hysteresis_model_from
 
     if hysteresis_model_from(calibration.hysteresis) is None:
         return float(calibration.held_out_max_zernike)
-    return float(IN_USE * calibration.hysteresis.held_out_max_zernike)
+    return float(REQUEST_ERROR_RATIO * calibration.hysteresis.held_out_max_zernike)
 
 
 def unknown_history(capabilities: Any) -> str:
@@ -111,7 +111,7 @@ def kept(promised: float, measured: float) -> bool:
 def verdict(promised: float, measured: float) -> str:
     """Promised (0 = not known) and measured largest coefficient error (m), and whether the promise was kept."""
     judged = "[green]inside[/]" if kept(promised, measured) else "[red]outside[/]"
-    found = f"promised {promise(promised)}, measured {told_from(measured, promised)}"
+    found = f"promised {promise(promised)}, measured {distinct_from(measured, promised)}"
     return f"{found}: {judged}" if promised > 0.0 else found
 
 

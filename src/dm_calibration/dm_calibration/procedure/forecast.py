@@ -11,7 +11,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
 from dm_common import Floats
-from dm_common.figures import in_nanometres, rounded, told_from
+from dm_common.figures import distinct_from, in_nanometres, rounded
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 

@@ -28,7 +28,7 @@ from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.lifecycle import OK, WARN, ManagedNode
 from dm_common.ros.worker import WorkerService
-from dm_common.values import wholes, without_figures
+from dm_common.values import fill_with_nan, wholes
 
 #: Longest wait for a report of the driver after a map, s of wall time (it reports every 0.5 s).
 REPORT_WAIT_S = 3.0
@@ -214,7 +214,7 @@ class MapListener:
         self._refused, self._last_refusal = self._refused + 1, reason
 
     def _on_update(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> Any:
-        without_figures(response)  # until they are known
+        fill_with_nan(response)  # until they are known
         try:
             if request.forget:
                 self._forget(request, response)
@@ -251,7 +251,7 @@ class MapListener:
                         raise
                 # A map is refused unless the mirror rests before and after it, which corrections of creep may delay.
                 becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
-                measured = self._services.measure_as_it_stands("calibration check")
+                measured = self._services.measure_present_shape("calibration check")
                 try:
                     verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
                 except MapNotUsableError as error:

@@ -14,7 +14,7 @@ from dm_calibration.regression.predictor import ErrorPredictor, fit_predictor
 from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions
 from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.messages import doubles
-from dm_common.values import reals, without_figures
+from dm_common.values import fill_with_nan, reals
 
 
 class ErrorPrediction:
@@ -77,7 +77,7 @@ class ErrorPrediction:
                 raise Refusal(predictor.error_code, str(predictor))
             # E.g. a calibration of pokes alone. No warning, since the controller requests this of every calibration.
             response.error_code, response.message = predictor.error_code, str(predictor)
-            return without_figures(response)
+            return fill_with_nan(response)
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
         method = predictor.influence.method
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"

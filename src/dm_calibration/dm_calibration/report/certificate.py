@@ -18,9 +18,9 @@ from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
 from dm_common.bounded import BoundedProgramme
-from dm_common.figures import two_fold
+from dm_common.figures import accuracy_text
 from dm_common.geometry import neighbour_pairs
-from dm_common.hysteresis.law_shape import certain_limits
+from dm_common.hysteresis.law_shape import worst_case_limits
 from dm_common.limits import Limits
 from dm_common.optics.conic import conic_coefficients, curvatures_text, reachable_range
 from dm_common.optics.zernike import PISTON_TILT
@@ -65,7 +65,7 @@ def spheres(calibration: Calibration) -> tuple[float, float, float]:
     apart = float(np.abs(maps.applied[:, pairs[:, 0]] - maps.applied[:, pairs[:, 1]]).max(initial=1e-6))
     limits = Limits(fit.signal_min, fit.signal_max, pairs, apart)
     if calibration.hysteresis is not None:
-        limits = certain_limits(calibration.hysteresis.law, limits)
+        limits = worst_case_limits(calibration.hysteresis.law, limits)
     terms, offset = fit.influence_zernike[PISTON_TILT:], fit.zernike_offset[PISTON_TILT:]
     programme = BoundedProgramme(terms, limits, RIDGE * float(np.square(terms).sum()))
 

@@ -35,7 +35,7 @@ DAC_STEP = 2.0**-15
 #: Most rounds of the programme; change of signals, and share by which a round reduces the error, below which it ends.
 ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
 #: Weight of changes, relative to the largest gain of the matrix; factors on it after a failed and a successful round.
-NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
+DAMPING, DAMPING_RAISED, DAMPING_LOWERED = 0.003, 10.0, 0.3
 #: Half the signal step of the finite differences that give the slope of the law.
 SLOPE_STEP = 1e-4
 
@@ -46,11 +46,11 @@ class Inverted:
 
     Attributes:
         signals: (N,) inside the limits.
-        missed: (N,) wanted minus reached effective signals; non-zero only where a limit was met.
+        residual: (N,) wanted minus reached effective signals; non-zero only where a limit was met.
     """
 
     signals: Floats
-    missed: Floats
+    residual: Floats
 
 
 def invert(
@@ -77,11 +77,11 @@ def invert(
         last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
         if not LAG_LEFT < left < last:  # a growing change means divergence
             break
-    if not inverted.missed.any():
+    if not inverted.residual.any():
         return inverted
     # A limit may lie before the onset of the piece that holds the solution: the law itself gives what is missed.
-    missed = np.where(inverted.missed, wanted - law.position_at(state, inverted.signals), 0.0)
-    return Inverted(inverted.signals, missed)
+    residual = np.where(inverted.residual, wanted - law.position_at(state, inverted.signals), 0.0)
+    return Inverted(inverted.signals, residual)
 
 
 class Pieces:
@@ -184,7 +184,7 @@ class ConstrainedInverse:
         self._law, self._limits = law, limits
         stacked = np.vstack((matrix, np.sqrt(ridge) * np.eye(matrix.shape[1])))
         orthogonal, self._root = np.linalg.qr(stacked)
-        self._near = NEAR * float(np.linalg.norm(self._root, 2)) * np.eye(matrix.shape[1])
+        self._damping = DAMPING * float(np.linalg.norm(self._root, 2)) * np.eye(matrix.shape[1])
         self._project = orthogonal[: len(matrix)].T
 
     def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> tuple[Floats, Floats]:
@@ -205,18 +205,18 @@ class ConstrainedInverse:
         def rise(signals: Floats) -> Floats:
             return (reached(signals + SLOPE_STEP) - reached(signals - SLOPE_STEP)) / (2.0 * SLOPE_STEP)
 
-        def missed(effective: Floats) -> float:
+        def residual_norm(effective: Floats) -> float:
             return float(np.linalg.norm(self._root @ effective - wanted))
 
         signals = np.clip(start, limits.low, limits.high)
         effective, slope = reached(signals), rise(signals)
-        least, near = np.inf, self._near  # the start may violate limits
+        least, damping = np.inf, self._damping  # the start may violate limits
         for _ in range(ROUNDS):
-            programme = BoundedProgramme(np.vstack((self._root * slope, near)), limits)
+            programme = BoundedProgramme(np.vstack((self._root * slope, damping)), limits)
             straight = wanted - self._root @ (effective - slope * signals)
-            found = programme.solve(np.concatenate((straight, near @ signals)))
+            found = programme.solve(np.concatenate((straight, damping @ signals)))
             step, there = found - signals, reached(found)
-            gained = least - missed(there)
+            gained = least - residual_norm(there)
             if gained > 0.0:
                 signals, effective = found, there
                 slope = rise(signals)
@@ -224,9 +224,9 @@ class ConstrainedInverse:
                 # Actuators that turn within the step change their slopes: the chord of the whole step is more accurate.
                 np.divide(there - effective, step, out=slope, where=np.abs(step) > SLOPE_STEP)
                 half = signals + 0.5 * step
-                if missed(reached(half)) < least:
+                if residual_norm(reached(half)) < least:
                     signals, effective = half, reached(half)
-            least, near = missed(effective), near * (LESS_NEAR if gained > 0.0 else NEARER)
+            least, damping = residual_norm(effective), damping * (DAMPING_LOWERED if gained > 0.0 else DAMPING_RAISED)
             if np.abs(step).max() <= CONVERGED or 0.0 < gained < GAINED * least:
                 break
         return signals, effective

@@ -67,7 +67,7 @@ def normalised(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Hy
     return law.scaled((high - low) / span(law, low, high))
 
 
-def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
+def worst_case_limits(law: HysteresisModel, limits: Limits) -> Limits:
     """Limits on effective signals that signals within `limits` reach whatever the history.
 
     Hysteresis and creep narrow the range; each end is the innermost one over random histories.

@@ -33,7 +33,7 @@ CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
 CREEP_RATE_MAX = 0.2
 #: Assumed ratio of the errors of requests to those of held-out moves of the calibration. Held-out moves follow each
 #: other within seconds; requests are held for longer, and their errors are 1.2 to 2.6 times as large.
-IN_USE = 1.4
+REQUEST_ERROR_RATIO = 1.4
 
 
 @dataclass(frozen=True, eq=False)

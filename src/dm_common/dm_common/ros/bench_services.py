@@ -93,7 +93,7 @@ class BenchServices:
         self._said = ""
 
     @contextmanager
-    def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
+    def held(self, request: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
         """Hold the mirror during the block: commands of other clients are refused.
 
         Arguments as those of `MirrorHolder.held`.
@@ -103,7 +103,7 @@ class BenchServices:
         """
         with ExitStack() as stack:
             with self._answered("hold_mirror", self._driver, self._set_signals.service_is_ready) as stop:
-                stack.enter_context(self.hold.held(asked, purpose, duration, self._values["driver_timeout"], stop))
+                stack.enter_context(self.hold.held(request, purpose, duration, self._values["driver_timeout"], stop))
             yield
 
     def check_ready(self) -> None:
@@ -133,8 +133,8 @@ class BenchServices:
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
             self.check_history()
             self._history_known = False
-            gone = self._driver.since_now()
-            result = run_goal(self._degauss, goal, timeout, stop=stop, gone=gone, send_by=self.hold.command)
+            lost = self._driver.since_now()
+            result = run_goal(self._degauss, goal, timeout, stop=stop, server_lost=lost, send_by=self.hold.command)
             if result.error_code != ErrorCode.OK and stop():
                 raise ServiceCallError("degauss: cancelled")
         self._check("degauss", result)
@@ -165,7 +165,7 @@ class BenchServices:
                 failure = error
         raise Refusal(failure.error_code, f"{failure} ({_TRIES} tries)") from failure
 
-    def measure_as_it_stands(self, label: str) -> Measurement:
+    def measure_present_shape(self, label: str) -> Measurement:
         """One map of the shape as it stands; does not wait for an interferometer to return. Raises as `measure`."""
         return self._measured(label, lambda: None)
 
@@ -263,16 +263,16 @@ class BenchServices:
     def _answered(self, what: str, server: qos.Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
         """For a call of `what` at `server`: yield the condition that ends its wait; turn its failure into a Refusal."""
         server.wait_for_return(self._stopping)
-        gone = server.since_now(ready)
+        lost_reason = server.since_now(ready)
         try:
-            yield lambda: self._stopping() or bool(gone())
+            yield lambda: self._stopping() or bool(lost_reason())
         except ServiceCallError as error:
             if self.cancelled() or not self._node.context.ok():  # a Refusal would be journalled as a failed map
                 raise Cancelled("cancelled") from error
             if self.hold.lost is not None:
                 raise self.hold.lost from error
             code = ErrorCode.DRIVER_UNAVAILABLE if server is self._driver else ErrorCode.INTERFEROMETER_UNAVAILABLE
-            raise Refusal(code, f"{what}: {text}" if (text := gone()) else str(error)) from error
+            raise Refusal(code, f"{what}: {text}" if (text := lost_reason()) else str(error)) from error
 
     @staticmethod
     def _check(what: str, response: Any) -> None:

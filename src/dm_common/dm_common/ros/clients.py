@@ -122,7 +122,7 @@ def run_goal(
     answer_s: float | None = None,
     on_feedback: Callable[[Any], None] = lambda feedback: None,
     stop: Callable[[], bool] = lambda: False,
-    gone: Callable[[], object] = lambda: False,
+    server_lost: Callable[[], object] = lambda: False,
     identity: Any = None,
     send_by: Callable[[Callable[[], Any]], Any] = lambda send: send(),
 ) -> Any:
@@ -133,7 +133,7 @@ def run_goal(
         answer_s: longest wait for the server, and for its answer to the goal, s; None = `timeout_s`.
         on_feedback: called by the executor.
         stop: becomes true to cancel the goal; its result is still awaited and returned.
-        gone: whether the server is known to be gone; the wait for it then ends.
+        server_lost: whether the server is known to be gone; the wait for it then ends.
         identity: of the goal, a unique_identifier_msgs/UUID; None = any.
         send_by: called with a function that sends the goal; returns what that function returns.
 
@@ -146,12 +146,12 @@ def run_goal(
     def wait(condition: Callable[[], bool], seconds: float, missing: str, hint: str = "") -> None:
         deadline = time.monotonic() + seconds
         while not condition():
-            if gone() or time.monotonic() > deadline:
+            if server_lost() or time.monotonic() > deadline:
                 raise ServiceCallError(f"{name}: {missing}{f' within {seconds:g} s' * math.isfinite(seconds)}{hint}")
             time.sleep(0.005)
 
     wait(lambda: stop() or client.server_is_ready(), answer_s, "no such action", "; is its node running?")
-    if stop() or gone():
+    if stop() or server_lost():
         raise ServiceCallError(f"{name}: cancelled before it began; nothing has changed", ErrorCode.CANCELED)
     accepted = send_by(lambda: client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity))
     try:
@@ -163,18 +163,18 @@ def run_goal(
             wait(finished.done, timeout_s, "not finished")
         return finished.result().result
     except BaseException as error:
-        became = "whether it has begun is not known (./dm status)"
+        outcome = "whether it has begun is not known (./dm status)"
         with suppress(ServiceCallError):
             wait(accepted.done, answer_s, "no answer to the goal")
             accepted.result().cancel_goal_async()
-            time.sleep(SEND_S if gone() else 0.0)
-            became = "asked to cancel; it ends with what is under way, such as a fit (./dm status)"
+            time.sleep(SEND_S if server_lost() else 0.0)
+            outcome = "asked to cancel; it ends with what is under way, such as a fit (./dm status)"
             finished = accepted.result().get_result_async()
             wait(finished.done, CANCEL_S, "not finished")
             ended = finished.result().result
-            became = ended.message if ended.error_code else f"done already: {ended.message}"
+            outcome = ended.message if ended.error_code else f"done already: {ended.message}"
         if isinstance(error, KeyboardInterrupt):
-            error.args = (f"{name}: {became}",)
+            error.args = (f"{name}: {outcome}",)
         raise
 
 
@@ -184,16 +184,16 @@ class MirrorHolder:
     A restarted driver receives the renewal too, so that the hold survives the restart.
 
     Args:
-        gone: whether the driver is known to be gone; the wait for the release of a hold then ends.
+        driver_lost: whether the driver is known to be gone; the wait for the release of a hold then ends.
 
     Attributes:
         holder: name of the holder, sent with every command as well.
         lost: the refusal, once somebody else has taken the mirror over; None before.
     """
 
-    def __init__(self, node: Node, name: str, gone: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, node: Node, name: str, driver_lost: Callable[[], bool] = lambda: False) -> None:
         self.holder = self._name = name
-        self._gone = gone
+        self._driver_lost = driver_lost
         self.lost: Refusal | None = None
         self._client = node.create_client(HoldMirror, "hold_mirror")
         self._request = HoldMirror.Request(holder=name)
@@ -206,7 +206,7 @@ class MirrorHolder:
     @contextmanager
     def held(
         self,
-        asked: Any,
+        request: Any,
         purpose: str,
         duration: float,
         timeout_s: float,
@@ -215,7 +215,7 @@ class MirrorHolder:
         """Hold the mirror during the block.
 
         Args:
-            asked: the goal or request that needs the mirror. If its `holder` has the mirror already, that hold is used,
+            request: a goal or request that needs the mirror. If its `holder` has the mirror already, that hold is used,
                 and neither renewed nor released here. Its `take_over` ends the hold of anybody else.
             purpose: of the hold, and how to end it, for clients that are refused meanwhile.
             duration: expected duration, s; 0 = not known.
@@ -227,16 +227,16 @@ class MirrorHolder:
             ServiceCallError: there is no driver.
         """
         busy = f"{self._name} holds the mirror already: {self._request.purpose}"
-        self.wait_for(lambda: self._one.acquire(blocking=False), asked, busy, timeout_s)
+        self.wait_for(lambda: self._one.acquire(blocking=False), request, busy, timeout_s)
         try:
             self.lost, self.holder = None, self._name
             self._request.purpose, self._request.duration = purpose, duration
             answer = self._ask(HoldMirror.Request.HOLD, timeout_s, cancelled)
-            if answer.error_code == ErrorCode.BUSY and answer.holder == asked.holder:
-                self.holder = asked.holder
+            if answer.error_code == ErrorCode.BUSY and answer.holder == request.holder:
+                self.holder = request.holder
                 yield
                 return
-            if answer.error_code == ErrorCode.BUSY and asked.take_over:
+            if answer.error_code == ErrorCode.BUSY and request.take_over:
                 answer = self._ask(HoldMirror.Request.TAKE_OVER, timeout_s, cancelled)
             if answer.error_code != ErrorCode.OK:
                 raise Refusal(answer.error_code, answer.message)
@@ -248,19 +248,19 @@ class MirrorHolder:
                 self._timer.cancel()
                 if self.lost is None:
                     with suppress(ServiceCallError):  # the driver is gone
-                        self._ask(HoldMirror.Request.RELEASE, RELEASE_S, self._gone)
+                        self._ask(HoldMirror.Request.RELEASE, RELEASE_S, self._driver_lost)
         finally:
             self._one.release()
 
-    def wait_for(self, free: Callable[[], bool], asked: Any, busy: str, timeout_s: float) -> None:
-        """Wait until `free()` if the request `asked` takes the mirror over from another run of this node, ending that.
+    def wait_for(self, free: Callable[[], bool], request: Any, busy: str, timeout_s: float) -> None:
+        """Wait until `free()` if the `request` takes the mirror over from another run of this node, ending that.
 
         Raises:
-            Refusal: BUSY with the sentence `busy`, if `asked` does not take over, or the run does not end in time.
+            Refusal: BUSY with the sentence `busy`, if `request` does not take over, or the run does not end in time.
         """
         deadline = time.monotonic() + timeout_s
         while not free():
-            if not asked.take_over or time.monotonic() > deadline:
+            if not request.take_over or time.monotonic() > deadline:
                 raise Refusal(ErrorCode.BUSY, busy)
             self.lost = Refusal(ErrorCode.PREEMPTED, "a newer run of the same node has taken the mirror over")
             time.sleep(0.02)

@@ -227,34 +227,34 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
 def until_discovered(send: Callable[..., None]) -> Callable[..., None]:
     """Wrap `send` so that an answer that was dropped is sent again, from a thread of its own."""
 
-    def patient(*answer: Any) -> None:
+    def resend_if_dropped(*answer: Any) -> None:
         if _dropped(send, *answer):
             _send_again(send, *answer)
 
-    return patient
+    return resend_if_dropped
 
 
-class PatientActionServer(ActionServer):
+class ResendingActionServer(ActionServer):
     """An action server that accepts every goal, and sends acceptance and result again when they were dropped."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
-        self._judged = self._begun = 0.0
+        self._accepted_at = self._executed_at = 0.0
 
-        def judge(_goal: Any) -> GoalResponse:
-            self._judged = time.monotonic()
+        def accept(_goal: Any) -> GoalResponse:
+            self._accepted_at = time.monotonic()
             return GoalResponse.ACCEPT
 
-        def begin(goal_handle: ServerGoalHandle) -> None:
-            self._begun = time.monotonic()
+        def execute(goal_handle: ServerGoalHandle) -> None:
+            self._executed_at = time.monotonic()
             goal_handle.execute()
 
-        super().__init__(*arguments, goal_callback=judge, handle_accepted_callback=begin, **keywords)
+        super().__init__(*arguments, goal_callback=accept, handle_accepted_callback=execute, **keywords)
 
     async def _execute_goal_request(self, request: Any) -> None:
-        self._judged = self._begun = 0.0
+        self._accepted_at = self._executed_at = 0.0
         await super()._execute_goal_request(request)
-        # rclpy sends the answer after judging a goal and before beginning it.
-        if self._begun - self._judged >= DROPPED_S:
+        # rclpy sends the answer after accepting a goal and before executing it.
+        if self._executed_at - self._accepted_at >= DROPPED_S:
             answer = self._action_type.Impl.SendGoalService.Response(accepted=True)
             _send_again(self._handle.send_goal_response, request[0], answer)
 

@@ -67,12 +67,12 @@ class ManagedNode(LifecycleNode):
 
     Attributes:
         configured, active: its state.
-        session: if it `rests`, changes with every activation and deactivation, which makes earlier goals invalid.
+        session: if it `requires_activation`, changes with every (de)activation, which makes earlier goals invalid.
     """
 
     #: True: parameters that are not live change only while the node is inactive, and requests are then refused with
     #: NODE_INACTIVE. False: they change only while it is not configured, and the node judges requests by itself.
-    rests = True
+    requires_activation = True
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class ManagedNode(LifecycleNode):
         self.session = 0
         self._trouble = ""
         self._made: Mapping[str, Any] | None = None  # parameters of the last `configure`
-        self._unlock = "deactivate" if self.rests else "cleanup"
+        self._unlock = "deactivate" if self.requires_activation else "cleanup"
         self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
         self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
         for service in self.services:
@@ -98,7 +98,7 @@ class ManagedNode(LifecycleNode):
     # --- what nodes do ---
 
     def configure(self) -> None:
-        """Set up the node from its parameters; if it `rests`, again before an activation when they have changed."""
+        """Set up the node from its parameters; with `requires_activation`, again before activation if they changed."""
 
     def activate(self) -> None:
         """Begin to work."""
@@ -113,7 +113,7 @@ class ManagedNode(LifecycleNode):
         """Called with the reason when the parameters are not acceptable."""
 
     def health(self) -> Health:
-        """Health of the node; if it `rests`, called only while it is active."""
+        """Health of the node; if it `requires_activation`, called only while it is active."""
         return Health()
 
     # --- what all have in common ---
@@ -129,17 +129,17 @@ class ManagedNode(LifecycleNode):
         return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"
 
     def check_active(self) -> None:
-        """Raise Refusal if the node `rests` and is not active."""
-        if self.rests and (reason := self.inactive()):
+        """Raise Refusal if the node `requires_activation` and is not active."""
+        if self.requires_activation and (reason := self.inactive()):
             raise Refusal(ErrorCode.NODE_INACTIVE, reason)
 
     def _health_in_any_state(self) -> Health:
-        if self.rests and (reason := self.inactive()):
+        if self.requires_activation and (reason := self.inactive()):
             return Health(ERROR if self._trouble else WARN, reason)
         return self.health()
 
     def _unlocked(self) -> bool:
-        return not (self.active if self.rests else self.configured)
+        return not (self.active if self.requires_activation else self.configured)
 
     def autostart(self) -> None:
         """Configure and activate the node unless its parameter `autostart` is false; called when it is served."""
@@ -186,7 +186,7 @@ class ManagedNode(LifecycleNode):
 
     def _rest(self) -> None:
         if self.active:
-            self.active, self.session = False, self.session + self.rests
+            self.active, self.session = False, self.session + self.requires_activation
             self.deactivate()
 
     def _release(self) -> None:
@@ -200,10 +200,10 @@ class ManagedNode(LifecycleNode):
         return done
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        if self.rests and (done := self._done(self._make)) != TransitionCallbackReturn.SUCCESS:
+        if self.requires_activation and (done := self._done(self._make)) != TransitionCallbackReturn.SUCCESS:
             return done
         super().on_activate(state)  # publishers, before anything is published
-        self.active, self.session = True, self.session + self.rests
+        self.active, self.session = True, self.session + self.requires_activation
         done = self._done(self.activate)
         if done == TransitionCallbackReturn.FAILURE:
             super().on_deactivate(state)

@@ -43,7 +43,7 @@ APPEAR_S = 5.0
 #: than others, by seconds on a busy machine.
 RETURN_S = 1.2
 #: Text on a node that is lost.
-GONE = "has died, was stopped or hangs: start it again"
+LOST_TEXT = "has died, was stopped or hangs: start it again"
 
 
 def with_lease(profile: QoSProfile) -> QoSProfile:
@@ -117,7 +117,7 @@ class Liveliness:
     @property
     def text(self) -> str:
         """What happened to a node that is missing, and what to do."""
-        return f"the node {self.name} {GONE if self.starts else 'is not running: start it'}"
+        return f"the node {self.name} {LOST_TEXT if self.starts else 'is not running: start it'}"
 
     def since_now(self, served: Callable[[], bool] = lambda: True) -> Callable[[], str]:
         """Return a function that checks whether the node is missing or was restarted since: then no answer can come.
@@ -126,12 +126,12 @@ class Liveliness:
         """
         starts = max(self.starts, 1)
 
-        def gone() -> str:
+        def lost_reason() -> str:
             if self.starts > starts:
                 return f"the node {self.name} was restarted meanwhile: ask again"
             return self.text if self.missing(served) else ""
 
-        return gone
+        return lost_reason
 
     def _on_change(self, info: Any) -> None:
         lost = info.alive_count == 0

@@ -22,14 +22,14 @@ TASKS, NAME = Path("/proc/self/task"), "dds.ev."
 #: once seen to wake, that shows a deadlock. These threads wake for each lease and at least for every announcement: each
 #: second with config/fastdds.xml of dm_bringup, every three without it. Checks are counted rather than time, so that a
 #: stopped process or a machine that slept continues where it was.
-LOOK_S, LOOKS = 3.0, 15
+CHECK_S, CHECKS = 3.0, 15
 #: Time allowed for the ramp to the safe shape, s; the kernel then kills the process, which could never end by itself.
 END_S = 15
 
 
 def watch() -> None:
     """Watch this process from a thread of its own."""
-    threading.Thread(target=_watch, args=(LOOK_S, end), name="stall", daemon=True).start()
+    threading.Thread(target=_watch, args=(CHECK_S, end), name="stall", daemon=True).start()
 
 
 def wakes(tasks: Path = TASKS) -> dict[str, int]:
@@ -43,14 +43,14 @@ def wakes(tasks: Path = TASKS) -> dict[str, int]:
     return found
 
 
-def _watch(pause: float, stand_still: Callable[[], None], tasks: Path = TASKS) -> None:
+def _watch(pause: float, on_deadlock: Callable[[], None], tasks: Path = TASKS) -> None:
     seen: dict[str, tuple[int, float]] = {}  # number of its waits, and checks without a new one
     while now := wakes(tasks):
         for thread, count in now.items():
-            before, looks = seen.get(thread, (count, -math.inf))
-            seen[thread] = (count, looks + 1 if count == before else 0)
-        if any(seen[thread][1] >= LOOKS for thread in now):
-            stand_still()
+            before, checks = seen.get(thread, (count, -math.inf))
+            seen[thread] = (count, checks + 1 if count == before else 0)
+        if any(seen[thread][1] >= CHECKS for thread in now):
+            on_deadlock()
             return
         time.sleep(pause)
 

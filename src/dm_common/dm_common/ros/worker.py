@@ -21,8 +21,8 @@ from rclpy.service import Service
 from dm_common.errors import EXPECTED, ClockError, ErrorCode, Refusal, error_code
 from dm_common.messages import answer_with
 from dm_common.ros import qos
-from dm_common.ros.executor import PatientActionServer, until_discovered
-from dm_common.values import Fields, without_figures
+from dm_common.ros.executor import ResendingActionServer, until_discovered
+from dm_common.values import Fields, fill_with_nan
 
 #: Every known client fetches its result at once; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
@@ -64,7 +64,7 @@ def never_silent(
             return callback(request, response)
         except EXPECTED as error:
             if response == type(response)():  # otherwise the callback has filled it in already
-                without_figures(response)
+                fill_with_nan(response)
             refused = str(error)
             answer_with(response, error_code(error), refused)
             if refused != before:
@@ -120,7 +120,7 @@ class WorkerGoal:
     def __init__(self, handle: ServerGoalHandle, node: Node) -> None:
         self.handle, self._node = handle, node
         self.request, self.publish_feedback = handle.request, handle.publish_feedback
-        self.taken_over, self._begun, self.since = False, self._session, time.monotonic()
+        self.taken_over, self._session_at_start, self.since = False, self._session, time.monotonic()
 
     @property
     def _session(self) -> int:
@@ -134,12 +134,12 @@ class WorkerGoal:
     @property
     def ended_by(self) -> str:
         """What ends the goal other than its client, as a sentence; "" = nothing."""
-        if self._session != self._begun:
+        if self._session != self._session_at_start:
             return f"{self._node.get_name()} was deactivated"
         return "a newer goal has taken over" if self.taken_over else ""
 
 
-class WorkerActionServer(PatientActionServer):
+class WorkerActionServer(ResendingActionServer):
     """An action server whose body runs in a worker thread.
 
     `body(goal) -> (outcome, result)` may block; `outcome` is "succeed", "abort" or "canceled". It should return soon
@@ -197,8 +197,8 @@ class WorkerActionServer(PatientActionServer):
 
     def _check_free(self, goal: Any) -> None:
         """Raise Refusal while another goal runs that this one does not take over."""
-        asked = getattr(goal, "request", goal)  # `take_over` may be in a FocusRequest inside the goal
-        if self._exclusive == "refuse" and self.busy and not asked.take_over:
+        request = getattr(goal, "request", goal)  # `take_over` may be in a FocusRequest inside the goal
+        if self._exclusive == "refuse" and self.busy and not request.take_over:
             assert self._newest is not None
             lasts = time.monotonic() - self._newest.since
             text = f"action {self._worker_name} has been running for {lasts:.0f} s: cancel it first, or set take_over"
@@ -216,7 +216,7 @@ class WorkerActionServer(PatientActionServer):
                 raise
             self._admit(goal_handle.request)
         except Refusal as refusal:
-            result = without_figures(self._action_type.Result())
+            result = fill_with_nan(self._action_type.Result())
             answer_with(result, refusal.error_code, str(refusal))
             self._finish(goal_handle, "abort", result)
             return
@@ -233,7 +233,7 @@ class WorkerActionServer(PatientActionServer):
             with self._turn:
                 outcome, result = self._body(goal)
         except Exception as error:
-            outcome, result = "abort", without_figures(self._action_type.Result())
+            outcome, result = "abort", fill_with_nan(self._action_type.Result())
             _answer_error(self._worker_node, "action", error, result)
         finally:
             with self._bookkeeping:

@@ -13,7 +13,7 @@ from dm_msgs.msg import FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles
 from dm_common.ros.worker import WorkerGoal
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge
 from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.active_calibration import ActiveCalibration
@@ -24,8 +24,8 @@ from dm_controller.solvers.registry import make_solver
 def run_converge(bench: LoopBench, handle: WorkerGoal) -> tuple[str, Any]:
     """Outcome and result of a goal, with the figures of the best map; blocks, in the worker thread of the action."""
     steps: list[LoopStep] = []
-    goal, result = handle.request, without_figures(Converge.Result())
-    feedback = without_figures(Converge.Feedback())
+    goal, result = handle.request, fill_with_nan(Converge.Result())
+    feedback = fill_with_nan(Converge.Feedback())
     feedback.curvature = goal.request.curvature
 
     def report(step: LoopStep) -> None:

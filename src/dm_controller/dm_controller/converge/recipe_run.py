@@ -19,7 +19,7 @@ from dm_common.recipes import GOES_ON_WITHOUT, shape_text
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import WorkerGoal
-from dm_common.values import without_figures
+from dm_common.values import fill_with_nan
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.active_calibration import ActiveCalibration
@@ -46,8 +46,8 @@ class RecipeRun:
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
-        feedback = without_figures(BuildRecipes.Feedback())
-        result = without_figures(BuildRecipes.Result())
+        feedback = fill_with_nan(BuildRecipes.Feedback())
+        result = fill_with_nan(BuildRecipes.Result())
 
         def body() -> tuple[int, str]:
             return self._build_and_store(handle, feedback, result)

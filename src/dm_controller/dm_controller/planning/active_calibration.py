@@ -147,9 +147,9 @@ def active_calibration(
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         certain = calibrated
         if not planner.law.is_identity:
-            from dm_common.hysteresis.law_shape import certain_limits  # not imported at the start
+            from dm_common.hysteresis.law_shape import worst_case_limits  # not imported at the start
 
-            certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
+            certain = CalibratedMirror(model, worst_case_limits(planner.law, limits), hold_tilt, axis)
     except ValueError as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     return ActiveCalibration(calibration, calibrated, certain, planner, book)

@@ -19,7 +19,7 @@ from dm_msgs.msg import FocusRequest
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
-from dm_common.hysteresis.model import IN_USE, HysteresisModel, HysteresisState
+from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import SIGMAS_95, CalibratedMirror, Plan, rms_bounds
@@ -210,7 +210,7 @@ class Planner:
                 return found, None
         at = self.law.advance(state, arrival)
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
-        if not cut and np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
+        if not cut and np.abs(inverted.residual).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
             return inverted.signals, None
         wanted = self.mirror.matrix @ aim if target is None else self.mirror.rows(*self.mirror.wanted(target))
         signals, reached = self._constrained.solve(at, wanted, ahead, inverted.signals)
@@ -257,7 +257,7 @@ class Planner:
         """
         if error is None:
             found, model = self.hysteresis, self.mirror.model
-            error = model.held_out_max_zernike if found is None else IN_USE * found.held_out_max_zernike
+            error = model.held_out_max_zernike if found is None else REQUEST_ERROR_RATIO * found.held_out_max_zernike
         return math.hypot(error, 0.0 if known else self._unknown_history[0])
 
     def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import in_nanometres, two_fold, with_point
+from dm_common.figures import accuracy_text, in_nanometres, with_point
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -116,7 +116,7 @@ def show_result(result: Any, calibration: Any = None) -> None:
             f"held out{beforehand}; hysteresis {result.hysteresis_model}"
         )
     if calibration is not None:
-        console.print(f"when flat: {two_fold(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
+        console.print(f"when flat: {accuracy_text(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
     if warning := warning_in(result):
         console.print(f"[yellow]{warning}[/]", soft_wrap=True)
     for entry in result.dropped:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from dm_common.figures import two_fold
+from dm_common.figures import accuracy_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import (
     BUSY_S,
@@ -74,7 +74,7 @@ def check(
             )
         beyond = " beyond what is predicted" if shape is not None and shape.predicted >= MENTIONED else ""
         console.print(f"largest coefficient{beyond}: {verdict(promised, response.max_zernike)}")
-        console.print(two_fold(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
+        console.print(accuracy_text(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
         if not response.accepted:
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
         elif without:

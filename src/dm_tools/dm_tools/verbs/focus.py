@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import in_nanometres, two_fold
+from dm_common.figures import accuracy_text, in_nanometres
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import MENTIONED, REPORT_S, heard, naming_holder, promise, running_suite
@@ -89,7 +89,7 @@ def _show(state: Any, calibration: Any) -> None:
     )
     if calibration is not None:
         console.print(
-            two_fold(state.predicted_max_zernike_upper - predicted, calibration, state.curvature), soft_wrap=True
+            accuracy_text(state.predicted_max_zernike_upper - predicted, calibration, state.curvature), soft_wrap=True
         )
     if state.saturated:
         console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")

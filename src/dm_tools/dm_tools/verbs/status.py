@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from dm_common.errors import ErrorCode
-from dm_common.figures import two_fold
+from dm_common.figures import accuracy_text
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, console, in_namespace, write_json
 from dm_tools.running_suite import (
@@ -125,8 +125,8 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
         return "not known"
     farthest = max(capabilities.curvature_min, capabilities.curvature_max, key=abs)
     farthest = math.trunc(1e4 * farthest) / 1e4  # as the range is printed
-    known = min(calibration.instrument_error, calibration.scale_error) > 0.0
-    return two_fold(capabilities.error_bound, calibration, farthest) + (f", at {farthest:+.4f} 1/m" if known else "")
+    at = f", at {farthest:+.4f} 1/m" if min(calibration.instrument_error, calibration.scale_error) > 0.0 else ""
+    return accuracy_text(capabilities.error_bound, calibration, farthest) + at
 
 
 def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
