@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
@@ -51,14 +51,14 @@ def test_an_id_or_a_file_anywhere_is_found(
 ) -> None:
     assert find_calibration("older", store)[0].id == "older"
     elsewhere = CalibrationStore(tmp_path)
-    in_use = store.find("newer"), JUDGED_BY, ""
+    in_use = store.find("newer"), CRITERIA, ""
     monkeypatch.setattr(verb, "running_calibration", lambda _namespace: in_use)  # its node has a folder of its own
     report("older", tmp_path / "out", json=tmp_path / "figures.json")
     assert json.loads((tmp_path / "figures.json").read_text())["id"] == "older"
     assert find_calibration(str(store.find("older")), elsewhere)[1] == store.find("older")
     with pytest.raises(ValueError, match="calibrate first"):
         find_calibration("", elsewhere)
-    monkeypatch.setattr(verb, "running_calibration", lambda _namespace: (None, JUDGED_BY, ""))
+    monkeypatch.setattr(verb, "running_calibration", lambda _namespace: (None, CRITERIA, ""))
     monkeypatch.setattr(verb, "VIRTUAL", tmp_path / "bench")
     monkeypatch.setattr(verb, "HARDWARE", tmp_path / "hardware")
     with pytest.raises(ValueError, match=r"bench/calibrations or .*hardware: calibrate first"):

@@ -14,9 +14,9 @@ from dm_calibration.procedure.forecast import (
     TYPICAL_DEGAUSS_S,
     Forecast,
     GoodEnough,
+    error_after_one_map,
     expected_end,
     forecast,
-    left_of_one_map,
 )
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, Step, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -74,7 +74,7 @@ def test_what_is_left_follows_from_what_is_reached() -> None:
     mirror = make_mirror()
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
     first, *ends = sorted(plan.ends)
-    law = left_of_one_map(None, mirror)
+    law = error_after_one_map(None, mirror)
     end, expected = expected_end(plan, first - 1, 3e-9, 2e-9, law)
     assert end in ends and 1.7e-9 < expected <= 2e-9
     assert all(expected_end(plan, first - 1, 3e-9, 3e-9 * (first / other) ** 0.5, law)[0] == other for other in ends)
@@ -86,7 +86,7 @@ def test_before_the_law_is_found_nothing_is_expected() -> None:
     """11 nm after 89 maps of the shipped bench told 4.8 nm after 344 more; after 41 more it had 1.7 nm."""
     mirror = make_mirror(rings=3)
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=420, until=2e-9))
-    law = left_of_one_map(None, mirror)
+    law = error_after_one_map(None, mirror)
     assert expected_end(plan, 89, 11e-9, 2e-9, law) == (len(plan.steps), 0.0)
     assert expected_end(plan, 130, 2.5e-9, 2e-9, law)[1] == pytest.approx(2e-9, rel=0.1)
     assert expected_end(plan, 130, 2.5e-9, 2e-9, 0.3 * law)[1] == 0.0  # an earlier calibration was better

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate, CandidateProblem
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
-from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
+from dm_calibration.hysteresis.identify import ExcitationError, Identification, _own_law_fits, identify
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.run import Run
@@ -119,9 +119,9 @@ def test_a_richer_law_that_leaves_hardly_less_counts_as_the_simpler(monkeypatch:
 
     def seen(run: Run, candidate: Candidate, starts: Any, *rest: Any) -> Any:
         begun.extend(fit.candidate.name for fit in starts)
-        return _begun(run, candidate, starts, *rest)
+        return _own_law_fits(run, candidate, starts, *rest)
 
-    monkeypatch.setattr("dm_calibration.hysteresis.identify._begun", seen)
+    monkeypatch.setattr("dm_calibration.hysteresis.identify._own_law_fits", seen)
     richer = replace(PLAYS, name="one power more", powers=PLAYS.powers + 1)
     found = identify(*simulated_run("prandtl_ishlinskii", noise=1e-9), [LINEAR, PLAYS, richer, OWN])
     assert found.scores[richer.name] == found.scores[PLAYS.name]
@@ -254,7 +254,7 @@ def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest
     run: Any = SimpleNamespace(responses=SimpleNamespace(coefficients=2))
 
     def order(candidate: Candidate) -> list[Any]:
-        begun: Any = _begun(run, candidate, starts, np.ones(2), np.ones(4, dtype=bool), 0.1)
+        begun: Any = _own_law_fits(run, candidate, starts, np.ones(2), np.ones(4, dtype=bool), 0.1)
         return [fit.law for _, fit in begun]
 
     assert order(Candidate("fades", 30, 5, 4, own=True)) == [0.5, 1.0, 0.99]

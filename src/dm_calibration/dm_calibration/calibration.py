@@ -182,8 +182,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         raw: dict[str, Any] = {name: columns[f"maps/{name}"] for name in MapSet.columns()}
         maps = MapSet(points=points, **raw)
         # Older files hold nothing on the instrument's own error: not known.
-        untold: dict[str, Attribute] = {"system_error_subtracted": -1, "reference_surface": ""}
-        attributes = untold | {"instrument_error": 0.0, "scale_error": 0.0} | dict(attributes)
+        defaults: dict[str, Attribute] = {"system_error_subtracted": -1, "reference_surface": ""}
+        attributes = defaults | {"instrument_error": 0.0, "scale_error": 0.0} | dict(attributes)
         figures = [figure.name for figure in fields(InfluenceFit) if figure.name != "points"]
         result: dict[str, Any] = {
             name: columns[path] if (path := f"result/{name}") in columns else attributes[f"fit_{name}"]

@@ -21,9 +21,9 @@ from dm_common.recipes import RecipeBook, RecipeError
 CLEARLY_WORSE = 2.0
 
 
-def becomes(condition: Callable[[], bool], patience: float) -> bool:
-    """Whether `condition` holds now or becomes true within `patience` s of wall time."""
-    deadline = time.monotonic() + patience
+def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Whether `condition` holds now or becomes true within `timeout_s` s of wall time."""
+    deadline = time.monotonic() + timeout_s
     while not (held := condition()) and time.monotonic() < deadline:
         time.sleep(0.01)
     return held
@@ -68,7 +68,7 @@ class CalibrationManager:
         Raises:
             Refusal: the mirror is not known yet.
         """
-        becomes(lambda: self.mirror is not None, wait_s)
+        wait_until(lambda: self.mirror is not None, wait_s)
         if (mirror := self.mirror) is None:
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
         return mirror

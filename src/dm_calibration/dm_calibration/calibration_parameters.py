@@ -101,7 +101,7 @@ PARAMETERS = (
 )
 
 #: Parameters of the node by which a report judges a calibration, with their defaults.
-JUDGED_BY = {
+CRITERIA = {
     parameter.name: parameter.default
     for parameter in PARAMETERS
     if parameter.name in ("calibrated_error_max", "updates.stale_after", "updates.surprises_max")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.actuator_weights import ASKED, SPREADS, likeliest_spread, weights_of
+from dm_calibration.hysteresis.actuator_weights import SPREAD_ACTUATORS, SPREADS, likeliest_spread, weights_of
 
 ACTUATORS = 4
 
@@ -24,7 +24,7 @@ def test_weights_are_those_of_the_normal_equations() -> None:
 
 
 @pytest.mark.parametrize("spread", SPREADS)
-@pytest.mark.parametrize("actuators", [12, ASKED + 12])
+@pytest.mark.parametrize("actuators", [12, SPREAD_ACTUATORS + 12])
 def test_how_far_actuators_differ_is_told(spread: float, actuators: int) -> None:
     rng = np.random.default_rng(4)
     features, gains = rng.standard_normal((400, 20, actuators)), rng.standard_normal((actuators, 6))

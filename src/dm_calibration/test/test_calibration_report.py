@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
@@ -199,7 +199,7 @@ def test_message_and_certificate_agree(
     grades = np.array([grade] + [0] * 36, dtype=np.uint8)
     judged = replace(calibration, fit=replace(calibration.fit, grades=grades, held_out_max_zernike=promised))
     message = calibration_message(judged, None, "mirror", error_max)
-    values = JUDGED_BY | {"calibrated_error_max": error_max}
+    values = CRITERIA | {"calibrated_error_max": error_max}
     assert (message.quality == Capabilities.CALIBRATED) is good
     assert ("<td>calibrated</td>" in html_page("", [certificate(judged, {}, (), values)])) is good
 

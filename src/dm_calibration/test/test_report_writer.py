@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
@@ -31,7 +31,7 @@ def calibration() -> Calibration:
 
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
     published: list[tuple[str, bool]] = []
-    values = JUDGED_BY | {"updates.stale_after": 7 * 86400.0}
+    values = CRITERIA | {"updates.stale_after": 7 * 86400.0}
     writer = ReportWriter(lambda text, warning: published.append((text, warning)), values)
     store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)

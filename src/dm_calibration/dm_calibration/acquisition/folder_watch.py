@@ -80,7 +80,7 @@ class FolderWatch:
                 self._known_on[self._disk] = self._known
             self._disk, self._known = disk, self._known_on.pop(disk, None)
             if self._known is None:
-                self._known = self._seen_elsewhere(listed)
+                self._known = self._known_on_other_device(listed)
         if self._known is None:
             self._known = {name: _Candidate(signature, now, done=True) for name, signature in listed.items()}
         known = {name: candidate for name, candidate in self._known.items() if name in listed}
@@ -91,11 +91,11 @@ class FolderWatch:
                 known[name] = _Candidate(signature, now)
             elif not candidate.done and now - candidate.since >= self._stable_time:
                 candidate.done = True
-                ready.append((signature.modified_ns, self._judge(name, signature)))
+                ready.append((signature.modified_ns, self._event_of(name, signature)))
         self._known = known
         return [event for _time, event in sorted(ready)]
 
-    def _seen_elsewhere(self, listed: Mapping[str, Signature]) -> dict[str, _Candidate] | None:
+    def _known_on_other_device(self, listed: Mapping[str, Signature]) -> dict[str, _Candidate] | None:
         """Known files of a disk that has come back as another device, known by a `listed` file; None = none has."""
         for device, known in self._known_on.items():
             if any(listed.get(name) == candidate.signature for name, candidate in known.items()):
@@ -114,7 +114,7 @@ class FolderWatch:
             candidate = self._known.get(name)
             if candidate is None or candidate.signature != signature:
                 candidate = self._known[name] = _Candidate(signature, now)
-            event = self._judge(name, signature)
+            event = self._event_of(name, signature)
             if not candidate.done and not event.refused and is_complete(event.path):
                 candidate.done = True
                 ready.append(event)
@@ -142,7 +142,7 @@ class FolderWatch:
     def _matches(self, name: str) -> bool:
         return not name.startswith(".") and any(fnmatch.fnmatchcase(name.lower(), p) for p in self._patterns)
 
-    def _judge(self, name: str, signature: Signature) -> FileEvent:
+    def _event_of(self, name: str, signature: Signature) -> FileEvent:
         path = self.folder / name
         try:
             target = path.resolve(strict=True)

@@ -77,7 +77,7 @@ def outcome_of(
         if moved is not None:
             raise ValueError("moved: needs the times of the maps, which neither `times` nor the files state")
         if hysteresis:
-            untold = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
+            undated = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
             raise ValueError(
                 f"times: map {untold} has none, without which hysteresis cannot be separated from creep: give one in "
                 "s for each map"
@@ -180,11 +180,11 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
     last = next((one for one in found if one is not None), None)
     if last is None:
         raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
-    told = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns} or {0: 0}
+    stamps = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns} or {0: 0}
     # The time of a file without data is interpolated between the maps around it; 0 = no map on one side.
-    between_told = np.interp(range(len(found)), [*told], [*told.values()], left=0, right=0)
+    interpolated = np.interp(range(len(found)), [*stamps], [*stamps.values()], left=0, right=0)
     measured = []
-    for one, at in zip(found, between_told, strict=True):
+    for one, at in zip(found, interpolated, strict=True):
         last = without_map(last, stamp_ns=round(at)).record if one is None else one
         measured.append(last)
     return measured, dropped
@@ -195,9 +195,9 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
     if isinstance(one, str | Path):
         surface, measured = ingest.read(Path(one), settings)
         # Not the modification time: for copies that is the time of copying.
-        told = surface.time_stamp or 0.0  # in a damaged file NaN or absurd, and then not known
-        known = 0.0 < told <= time.time() + AHEAD_MAX_S
-        return replace(measured, stamp_ns=round(1e9 * told) if known else 0, sha256=surface.sha256)
+        stamp = surface.time_stamp or 0.0  # in a damaged file NaN or absurd, and then not known
+        known = 0.0 < stamp <= time.time() + AHEAD_MAX_S
+        return replace(measured, stamp_ns=round(1e9 * stamp) if known else 0, sha256=surface.sha256)
     sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data
     if sag.ndim != 2:
         raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), in m")

@@ -23,7 +23,7 @@ SPREADS = (0.05, 0.1, 0.2, 0.4, 0.8)
 SPREAD = 0.1
 #: Largest number of actuators, evenly chosen, that decide between SPREADS (of 37, every second one). The time that this
 #: takes grows with the third power of their number.
-ASKED = 20
+SPREAD_ACTUATORS = 20
 
 
 def alike(actuators: int, spread: float) -> tuple[float, float]:
@@ -72,11 +72,11 @@ def likeliest_spread(features: Floats, left: Floats, gains: Floats, weights: Flo
 
     Args:
         features, left, gains: as :func:`weights_of`; `left` in standard deviations.
-        weights: (F, N) so far; those of the actuators beyond ASKED are kept fixed.
+        weights: (F, N) so far; those of the actuators beyond SPREAD_ACTUATORS are kept fixed.
     """
-    asked = np.arange(features.shape[2]) % -(-features.shape[2] // ASKED) == 0
-    left = left - np.einsum("mfn,fn->mn", features[..., ~asked], weights[:, ~asked]) @ gains[~asked]
-    features, gains = features[..., asked], gains[asked]
+    chosen = np.arange(features.shape[2]) % -(-features.shape[2] // SPREAD_ACTUATORS) == 0
+    left = left - np.einsum("mfn,fn->mn", features[..., ~chosen], weights[:, ~chosen]) @ gains[~chosen]
+    features, gains = features[..., chosen], gains[chosen]
     count, actuators = features.shape[1:]
     right = np.einsum("mfn,mn->nf", features, left @ gains.T).ravel()
     flat = features.transpose(0, 2, 1).reshape(len(left), -1)

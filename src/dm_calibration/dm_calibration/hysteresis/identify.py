@@ -154,7 +154,7 @@ def identify(
         elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             common.sort(key=lambda scored: scored[0])
             starts = [fit for _, fit in common if fit.candidate.kind == candidate.kind]
-            for own, whole in _begun(run, candidate, starts, scatter, train, slope_min):
+            for own, whole in _own_law_fits(run, candidate, starts, scatter, train, slope_min):
                 consider(own, whole)
                 if candidate.name not in refused:
                     break
@@ -178,7 +178,7 @@ def identify(
     return Identification(fitted, held_out, closest, relative, refused, quiet)
 
 
-def _begun(
+def _own_law_fits(
     run: Run, candidate: Candidate, starts: Sequence[LawFit], scatter: Floats, keep: Bools, slope_min: float
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
     """Own laws that start from each of the common laws `starts`, fitted to the rows `keep`, in the order to be tried.

@@ -67,7 +67,7 @@ ROUNDS, ROUNDS_MAPS = 20, 300
 #: other, and in the end they have 12 to 30.
 OUTLIER_OF_FIT = 6.0
 #: Fewest maps per actuator from which the spread between actuators is estimated: a close fit to fewer overestimates it.
-ASKED_MAPS = 5
+SPREAD_MAPS = 5
 #: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in up to SHRINKS steps. If it
 #: has its own Duhem operator and would keep less than SHRUNK, it takes the common operator first. If it would keep less
 #: than LEAST, hardly any map may show where it is too flat: it is drawn halfway to the mean of the others instead, with
@@ -217,8 +217,8 @@ class OwnLaws:
             free = basis_of(self.run.figure[keep])
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            ask = self.spread is None and number == self._rounds_needed // 2 and len(free) >= ASKED_MAPS * len(gains)
-            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, ask)
+            due = self.spread is None and number == self._rounds_needed // 2 and len(free) >= SPREAD_MAPS * len(gains)
+            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, due)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -273,11 +273,11 @@ class OwnLaws:
         return self.run.responses.scatter(size)
 
     def _patterns(
-        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, ask: bool
+        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, find_spread: bool
     ) -> Floats:
-        """Weights (F, N): 1 for the signal itself, the others from maps and prior; `ask`: estimate the spread first."""
+        """Weights (F, N): 1 for the signal itself, the others from maps and prior; `find_spread`: estimate it first."""
         left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
-        if ask:
+        if find_spread:
             self.spread = likeliest_spread(features, left, gains, begin[1:])
         solved = weights_of(features, left, gains, alike(features.shape[2], self.spread or SPREAD), begin[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))

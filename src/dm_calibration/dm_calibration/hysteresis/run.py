@@ -61,8 +61,8 @@ class Run:
     def parts(self) -> list[tuple[slice, float]]:
         """Rows of each part of the run, and when the degauss before it had ended, s."""
         resumed = [] if self.segment is None else (np.flatnonzero(np.diff(self.segment)) + 1).tolist()
-        stood = self.time if self.moved is None else self.moved
-        starts = [min(self.start, float(self.time[0])), *(float(stood[row]) - BEFORE_FIRST_MAP_S for row in resumed)]
+        arrived = self.time if self.moved is None else self.moved
+        starts = [min(self.start, float(self.time[0])), *(float(arrived[row]) - BEFORE_FIRST_MAP_S for row in resumed)]
         bounds = pairwise((0, *resumed, len(self.time)))
         return [(slice(*bound), start) for bound, start in zip(bounds, starts, strict=True)]
 

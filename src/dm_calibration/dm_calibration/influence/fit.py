@@ -142,7 +142,7 @@ def fit_influence(
             f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were dropped. "
             "This calibration is doubtful."
         )
-    return _judge(maps, options, rings, limits, reasons, fitted, remarks)
+    return _result_of(maps, options, rings, limits, reasons, fitted, remarks)
 
 
 class _Fitted(NamedTuple):
@@ -194,7 +194,7 @@ def _fit_good(maps: MapSet, reasons: list[str]) -> _Fitted:
     return _Fitted(used, good, design, *regress(design, good))
 
 
-def _judge(
+def _result_of(
     maps: MapSet,
     options: FitOptions,
     rings: Ints | None,

@@ -112,14 +112,14 @@ def check_pokes(
     terms = only_terms(unit[active], points)
     single, double = active, {}
     for _ in range(2):  # again without actuators that move two places, which would distort the pose
-        stands = register(unit[single], single, points, x, y, radius, terms)
-        if stands is None:
+        registered = register(unit[single], single, points, x, y, radius, terms)
+        if registered is None:
             problem = (
                 "all channels move the same one or two places: check the wiring, mirror.pitch (or mirror.actuator_x "
                 "and _y), and that the maps are of this mirror"
             )
             return replace(nothing, findings=(*findings, problem))
-        registration = stands
+        registration = registered
         expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points, terms)
         height = np.maximum(height, np.finfo(float).tiny)
         table = np.zeros((count, count))

@@ -18,7 +18,7 @@ DEAD_SHARE = 0.02
 
 #: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, such as
 #: that of hysteresis in pokes, is no sign of a bad actuator.
-STANDS_OUT = 2.0
+UNCERTAIN_RATIO = 2.0
 
 #: Maps show hysteresis that no law describes if their error is at least this share of their moves; less may be noise.
 LOOPS_SHOW = 0.01
@@ -49,7 +49,7 @@ def grade(
     A response is the weighted rms sag of a unit signal, piston and tilt removed.
     """
     uncertainty, typical = _uncertainty(response, standard_error, excited)
-    uncertain = (uncertainty > STANDS_OUT * typical) & (response < options.weak_sigmas * standard_error)
+    uncertain = (uncertainty > UNCERTAIN_RATIO * typical) & (response < options.weak_sigmas * standard_error)
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
     overall = np.median(response[excited])
     ring_median = np.array(

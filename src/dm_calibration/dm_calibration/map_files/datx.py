@@ -128,10 +128,10 @@ def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> 
             node = None
     if node is None:
         return {}
-    told = ((name, np.asarray(value).ravel()) for name, value in node.attrs.items())
+    attributes = ((name, np.asarray(value).ravel()) for name, value in node.attrs.items())
     return {
         name.removesuffix(":Value").rpartition(".")[2]: value[0]
-        for name, value in told
+        for name, value in attributes
         if value.size == 1 and not name.endswith((":Unit", ":Converter"))
     }
 

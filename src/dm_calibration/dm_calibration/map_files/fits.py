@@ -54,8 +54,8 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
     if "CHECKSUM" in header and int(np.frombuffer(content[:end], ">u4").sum(dtype=np.uint64)) % 0xFFFFFFFF:
         raise MapFileError("CHECKSUM does not agree with the content: the file is damaged")
     stored = np.frombuffer(content, kind, width * height, start).reshape(height, width)[::-1]  # row 1 = bottom
-    told = str(header.get("BUNIT", ""))
-    metres = _unit(told, "BUNIT") if told or not unit else _unit(unit, "xyz_unit")
+    own_unit = str(header.get("BUNIT", ""))
+    metres = _unit(own_unit, "BUNIT") if own_unit or not unit else _unit(unit, "xyz_unit")
     sag = stored.astype(np.float64) * (_real(header, "BSCALE", 1.0) * metres) + _real(header, "BZERO", 0.0) * metres
     if stored.dtype.kind != "f" and "BLANK" in header:
         sag[stored == header["BLANK"]] = math.nan

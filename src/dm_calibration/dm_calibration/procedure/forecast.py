@@ -82,7 +82,7 @@ def forecast(
     tested = any(step.kind is StepKind.CHECK for step in plan.steps)
     if not tested or (earlier is None and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
         return expected
-    law = left_of_one_map(earlier, mirror)
+    law = error_after_one_map(earlier, mirror)
     for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):
         expected = Forecast(float(time[part - 1]), float(law / np.sqrt(part)), part)
         if expected.max_zernike <= until:
@@ -100,7 +100,7 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     )
 
 
-def left_of_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
+def error_after_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
     """Error of moves after one map, m, extrapolated from the `earlier` calibration of `mirror` or from typical mirrors.
 
     The error is inversely proportional to the root of the number of maps.
@@ -119,7 +119,7 @@ def expected_end(plan: Plan, done: int, reached: float, until: float, law: float
     Args:
         done: steps so far.
         reached: error after these, m.
-        law: m, see `left_of_one_map`.
+        law: m, see `error_after_one_map`.
     """
     if reached > WORST_LAW * law / np.sqrt(done):
         return len(plan.steps), 0.0

@@ -219,11 +219,11 @@ def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
     return steps
 
 
-def _surfaces(names: Sequence[str], mirror: Mirror, asked: bool, remarks: list[str]) -> list[Step]:
+def _surfaces(names: Sequence[str], mirror: Mirror, required: bool, remarks: list[str]) -> list[Step]:
     steps = []
     for name in names:
         if reason := surfaces.missing_on(name, mirror):
-            if asked:
+            if required:
                 raise ValueError(f"surface {reason}")
             remarks.append(f"left out: {reason}")
         elif name in surfaces.MODEL_NAMES:
@@ -233,7 +233,7 @@ def _surfaces(names: Sequence[str], mirror: Mirror, asked: bool, remarks: list[s
             steps.append(Step(name, StepKind.SURFACE, surface.signals))
             if surface.remark:
                 remarks.append(surface.remark)
-    if mirror.actuators > surfaces.TABLE_CHANNELS and not asked:
+    if mirror.actuators > surfaces.TABLE_CHANNELS and not required:
         remarks.append(f"Table 1 has a surface of their own for channels 1 to {surfaces.TABLE_CHANNELS} only")
     return steps
 

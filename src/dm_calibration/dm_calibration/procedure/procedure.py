@@ -109,7 +109,7 @@ class Procedure:
         self._bump = BumpCheck(self._options.bump, mirror, self._options.fit.hysteresis_allowance)
         for record, centre in zip(self.outcome.records, self.outcome.centres, strict=True):
             self._bump.take(MapTaken(record, centre=centre))
-        self._swung = False  # degaussed after an interruption, perhaps also realigned, since the last map
+        self._interrupted = False  # degaussed after an interruption, perhaps also realigned, since the last map
 
     def run(self) -> Outcome:
         """Go through all steps that are not done yet.
@@ -158,7 +158,7 @@ class Procedure:
             self._bench.degauss()
         self._note(Segment(self.outcome.segment + 1, time.time_ns()))
         self._bump.degaussed()
-        self._swung = True
+        self._interrupted = True
         step = Step(f"reference resumed {self.outcome.segment}", StepKind.REFERENCE, self._mirror.rest)
         self._report(step.label, step.kind, done)
         repeats = max(self._options.maps_per_state, RESUME_MAPS if self._plan.kind is PlanKind.HYSTERESIS else 1)
@@ -237,17 +237,17 @@ class Procedure:
                 if attempt == self._options.measure_retries:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
-        if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._swung):
+        if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._interrupted):
             taken = self._map(label, step, number, applied)  # a bad map or a moved mirror: a second map decides
-            if suspicion := self._bump.change(taken, self._swung):
+            if suspicion := self._bump.change(taken, self._interrupted):
                 self._stop_bumped(label, suspicion)
         self._note(taken)
         self._bump.take(taken)
-        self._swung = False
+        self._interrupted = False
 
     def _stop_bumped(self, label: str, suspicion: str) -> None:
         """End the run; the maps since the last good reference frame are in doubt."""
-        if self._swung:
+        if self._interrupted:
             raise Refusal(
                 ErrorCode.MAP_REJECTED,
                 f"{label}: {suspicion}: the mirror is not where it was before the run was interrupted. Put it back, "
@@ -293,5 +293,5 @@ class Procedure:
             return
         # A reference frame without a map becomes an ordinary command: it helps neither the figure nor the bump check.
         kind = StepKind.EXCITATION if step.kind is StepKind.REFERENCE else step.kind
-        told = {"label": step.label, "kind": kind.value, "step": number, "signals": step.signals, "applied": applied}
-        self._note(without_map(records[-1], **told))
+        changed = {"label": step.label, "kind": kind.value, "step": number, "signals": step.signals, "applied": applied}
+        self._note(without_map(records[-1], **changed))

@@ -22,7 +22,7 @@ DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 DISPLACED_SIGMA = 0.5
 #: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
 #: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
-TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
+DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
 #: displacements of up to 0.03.
 FAILED_SIGNAL = 0.05
@@ -78,7 +78,7 @@ def displaced_actuators(
         left = whole - columns[:, found] @ amounts
     size = np.abs(amounts)
     # Small moves of actuators without a response, whose bumps are not well known, are more likely other errors.
-    order = [int(k) for k in np.argsort(-size) if size[k] >= TELLING_SIGNAL or not silent[found[k]]]
+    order = [int(k) for k in np.argsort(-size) if size[k] >= DISTINCT_SIGNAL or not silent[found[k]]]
     displaced = {}
     for k in order:
         of_this = left + columns[:, found[k]] * amounts[k]
@@ -97,14 +97,14 @@ def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools) -
     size, whole = len(white), white @ white
     precision = 1.0 / DISPLACED_SIGMA**2
     left = whole - np.square(columns.T @ white) / (power + precision)
-    left = np.where(silent, _of_anything(left, size), left)
+    left = np.where(silent, _deviance(left, size), left)
     evidence = 0.5 * (whole - left) - 0.5 * np.log1p(power / precision)
-    something = 0.5 * (whole - _of_anything(whole, size))
-    all_of_them = np.append(evidence - np.log(evidence.size), something)
+    other_cause = 0.5 * (whole - _deviance(whole, size))
+    all_of_them = np.append(evidence - np.log(evidence.size), other_cause)
     return np.asarray(np.exp(all_of_them - np.logaddexp.reduce(all_of_them)))
 
 
-def _of_anything(square: Floats, size: int) -> Floats:
+def _deviance(square: Floats, size: int) -> Floats:
     """-2 log likelihood of a white difference in `size` values with that sum of squares and unknown variance (>= 1)."""
     return np.where(square > size, size * (1.0 + np.log(np.maximum(square, size) / size)), square)
 
@@ -133,15 +133,15 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
     sure = sorted(actuator for actuator, one in displaced.items() if one.probability >= SURE)
     shown, faults = list[str](), ""
     for actuator, (more, probability) in displaced.items():
-        stands = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
+        finding = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
         if silent[actuator]:
             stands = "moves, but showed no response in the calibration"
         elif given_up[actuator]:
-            stands += ", moves again"
+            finding += ", moves again"
         else:
-            stands += (fault := _fault(expected[actuator], more))
+            finding += (fault := _fault(expected[actuator], more))
             faults += fault if actuator in sure else ""
-        shown.append(f"actuator {actuator + 1} {stands} ({probability:.0%})")
+        shown.append(f"actuator {actuator + 1} {finding} ({probability:.0%})")
     found = ", ".join(shown)
     if given_up[sure].any():
         return f"{found}; ./dm check --forget uses it again"
@@ -154,7 +154,7 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
     return f"{found}; {condition}./dm check {without} continues without what does not move"
 
 
-def worst_elsewhere(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:
+def worst_other_error(displaced: Mapping[int, Displaced], expected: Floats, zernike: Floats) -> float:
     """Largest coefficient error (m) over all other shapes if actuators stay where a map shows them.
 
     The error of a stuck actuator is the move that it should make, which is largest to the far end of the range.
@@ -178,7 +178,7 @@ def failed(one: Displaced) -> bool:
 
 def _fault(signal: float, more: float) -> str:
     """The fault of an actuator that stands `more` beyond its effective `signal`; "" = one map cannot show it."""
-    if abs(signal) < TELLING_SIGNAL:
+    if abs(signal) < DISTINCT_SIGNAL:
         return ""
     share = 1.0 + more / signal
     if abs(share) < DEAD_SHARE:

@@ -14,7 +14,7 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_manager import CalibrationManager, becomes
+from dm_calibration.calibration_manager import CalibrationManager, wait_until
 from dm_calibration.calibration_messages import put_updates
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
@@ -61,7 +61,7 @@ class MapListener:
         self._turn = threading.Lock()  # one map at a time; held while measuring and judging
         self._exchange = threading.Lock()  # a map is compared under the law of its effective signals
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
-        self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
+        self._compared: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
         self._last_refusal = ""
         self._dirty = self._was_stale = False
@@ -173,8 +173,8 @@ class MapListener:
         try:
             with self._turn:
                 measured = measurement_from(answer)
-                if not any(measured.same_map(before) for before in self._judged):
-                    self._judge(measured, dry_run=False)
+                if not any(measured.same_map(before) for before in self._compared):
+                    self._compare(measured, dry_run=False)
         except EXPECTED as error:
             self._refuse(str(error))
             log.info(f"map not used: {error}", throttle_duration_sec=10.0)
@@ -182,7 +182,7 @@ class MapListener:
             self._refuse(f"{type(error).__name__}: {error}")
             log.error(f"map not used: {type(error).__name__}: {error}")
 
-    def _judge(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
+    def _compare(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
         """Compare a map with the calibration, and update it if they agree; `_turn` must be held.
 
         Args as of :meth:`RecalibrationManager.take`.
@@ -191,11 +191,11 @@ class MapListener:
             Refusal: a calibration is running, or the driver is silent.
             MapNotUsableError, StoreError: see :meth:`RecalibrationManager.take`.
         """
-        self._judged.append(measured)
+        self._compared.append(measured)
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
         measured = replace(measured, temperature=self._temperatures.at(at))
-        if not becomes(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
+        if not wait_until(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
@@ -250,10 +250,10 @@ class MapListener:
                     if not (request.dry_run and refusal.error_code == ErrorCode.BUSY):
                         raise
                 # A map is refused unless the mirror rests before and after it, which corrections of creep may delay.
-                becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
+                wait_until(self._is_at_rest, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_present_shape("calibration check")
                 try:
-                    verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
+                    verdict = self._compare(measured, request.dry_run, [number - 1 for number in request.without])
                 except MapNotUsableError as error:
                     if not request.dry_run:
                         self._refuse(str(error))
@@ -262,7 +262,7 @@ class MapListener:
         response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
         response.surprise = comparison.surprise
 
-    def _rests(self) -> bool:
+    def _is_at_rest(self) -> bool:
         now = 1e-9 * self._node.get_clock().now().nanoseconds
         return self.history.still_for(now) >= self._values["updates.still_time"]
 

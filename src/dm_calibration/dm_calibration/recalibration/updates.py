@@ -17,7 +17,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import described, without_response, worst_elsewhere
+from dm_calibration.recalibration.displaced import described, without_response, worst_other_error
 from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
@@ -171,8 +171,8 @@ class RecalibrationManager:
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
             else:
-                elsewhere = worst_elsewhere(*found, calibration.fit.influence_zernike)
-                worst = max(kept.drift.disagreement, comparison.max_zernike, elsewhere)
+                other_error = worst_other_error(*found, calibration.fit.influence_zernike)
+                worst = max(kept.drift.disagreement, comparison.max_zernike, other_error)
                 changed = replace(kept.drift, surprising=kept.drift.surprising + 1, disagreement=worst)
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration, changed)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
 from dm_calibration.report.checks import valid_until
@@ -84,7 +84,7 @@ def certificate(
     calibration: Calibration,
     names: Mapping[str, str],
     checks: Sequence[Check] = (),
-    values: Mapping[str, Any] = JUDGED_BY,
+    values: Mapping[str, Any] = CRITERIA,
     since: Sequence[str] = (),
 ) -> Section:
     """Verdict, range, promise, validity and names.
@@ -92,7 +92,7 @@ def certificate(
     Args:
         names: of `operator` and `instrument`.
         checks: made since the calibration, oldest first.
-        values: of the parameters named in JUDGED_BY.
+        values: of the parameters named in CRITERIA.
         since: sentences on why, by later checks, the calibration no longer holds, or only in part.
     """
     reasons = [*calibration.doubts(values["calibrated_error_max"]), *(sentence.rstrip(".") for sentence in since)]
@@ -100,7 +100,7 @@ def certificate(
     low, high, predicted = spheres(calibration)
     until, reason = valid_until(checks, calibration.promise, calibration.stamp_ns * 1e-9, values)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
-    reach, foretold, farthest = "neither flat nor mid range is within reach", "not known", 0.0
+    reach, prediction, farthest = "neither flat nor mid range is within reach", "not known", 0.0
     if np.isfinite(low):
         reach, farthest = curvatures_text(low, high, 3), max((low, high), key=abs)
         within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Picture, Section, Table
@@ -20,7 +20,7 @@ SHOWN = 20
 
 
 def valid_until(
-    checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = JUDGED_BY
+    checks: Sequence[Check], promised: float, measured_s: float, values: Mapping[str, Any] = CRITERIA
 ) -> tuple[float, str]:
     """Time until which a calibration is valid, s since the epoch, and the reason; the next calibration is due then.
 
@@ -30,7 +30,7 @@ def valid_until(
         checks: oldest first.
         promised: 95 % bound on the largest coefficient error, m.
         measured_s: time of the last map of the calibration, s since the epoch.
-        values: of the parameters named in JUDGED_BY.
+        values: of the parameters named in CRITERIA.
     """
     agreed = [check.time for check in checks if check.accepted]
     stale = max([measured_s, *agreed]) + values["updates.stale_after"]
@@ -52,12 +52,12 @@ def valid_until(
     return reached, f"the error grows by {per_month} and reaches the promise then"
 
 
-def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = JUDGED_BY) -> Section:
+def checks_section(calibration: Calibration, checks: Sequence[Check], values: Mapping[str, Any] = CRITERIA) -> Section:
     """Table, chart, and sentences on agreement, drift and validity.
 
     Args:
         checks: at least one, oldest first.
-        values: of the parameters named in JUDGED_BY.
+        values: of the parameters named in CRITERIA.
     """
     last, measured, promised = checks[-1], calibration.stamp_ns * 1e-9, calibration.promise
     days = max(last.time - measured, 1.0) / DAY_S

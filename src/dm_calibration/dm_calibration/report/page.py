@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
 from dm_calibration.recalibration.drift import UpdateOptions
@@ -21,8 +21,8 @@ from dm_calibration.report.pdf_pages import pdf_pages
 from dm_common.atomic_write import write_whole
 
 
-def sections(calibration: Calibration, file: Path, values: Mapping[str, Any] = JUDGED_BY) -> list[Section]:
-    """All sections of the report of `calibration`, read from `file`; `values` of the parameters named in JUDGED_BY.
+def sections(calibration: Calibration, file: Path, values: Mapping[str, Any] = CRITERIA) -> list[Section]:
+    """All sections of the report of `calibration`, read from `file`; `values` of the parameters named in CRITERIA.
 
     Raises:
         OSError: `file` cannot be read.
@@ -51,7 +51,7 @@ def sections(calibration: Calibration, file: Path, values: Mapping[str, Any] = J
 
 
 def write_report(
-    calibration: Calibration, folder: Path, file: Path, values: Mapping[str, Any] = JUDGED_BY
+    calibration: Calibration, folder: Path, file: Path, values: Mapping[str, Any] = CRITERIA
 ) -> tuple[Path, Path]:
     """Write ``<id>.html`` and ``<id>.pdf`` into `folder`, each atomically; returns the two files. Args as `sections`.
 

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from dm_calibration.calibration_parameters import JUDGED_BY
+from dm_calibration.calibration_parameters import CRITERIA
 from dm_calibration.store.calibration_store import CalibrationStore
 
 #: Time limit for one report, s of wall time; on a loaded machine it may take many times the usual few seconds.
@@ -29,10 +29,10 @@ class ReportWriter:
 
     Args:
         publish: called with a sentence and whether it is a warning, from the thread of the writer.
-        values: of the node's parameters; those of JUDGED_BY are read when a report is begun.
+        values: of the node's parameters; those of CRITERIA are read when a report is begun.
     """
 
-    def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = JUDGED_BY) -> None:
+    def __init__(self, publish: Callable[[str, bool], None], values: Mapping[str, Any] = CRITERIA) -> None:
         self._publish, self._values = publish, values
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reports")
@@ -65,7 +65,7 @@ class ReportWriter:
             self._waiting.discard(file)
             if self._ended:
                 return
-            values = json.dumps({name: self._values[name] for name in JUDGED_BY})
+            values = json.dumps({name: self._values[name] for name in CRITERIA})
             try:
                 self._process = process = subprocess.Popen(
                     [sys.executable, "-m", "dm_calibration.report.report_writer", str(file), values],

@@ -24,16 +24,16 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
 
     The file is None when there is none or the suite runs elsewhere; parameters are the defaults when nothing runs.
     """
-    from dm_calibration.calibration_parameters import JUDGED_BY
+    from dm_calibration.calibration_parameters import CRITERIA
     from dm_client import DeformableMirrorClient, DeformableMirrorError
 
     with DeformableMirrorClient(namespace) as client:
         runs = client.wait(lambda: nodes_of_suite(client), FIND_S)
         if not runs or (message := heard(client, "calibration", BUSY_S)) is None:
-            return None, JUDGED_BY, ""
-        values = JUDGED_BY
+            return None, CRITERIA, ""
+        values = CRITERIA
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)
-            values = {name: get_parameter(client, "calibration", name) for name in JUDGED_BY}
+            values = {name: get_parameter(client, "calibration", name) for name in CRITERIA}
         file = Path(message.file)
         return file if message.file and file.is_file() else None, values, message.mirror_serial
 
@@ -92,7 +92,7 @@ def report(
 
     Reads the stored file; needs no running nodes, but uses the parameters of those that run for that mirror.
     """
-    from dm_calibration.calibration_parameters import JUDGED_BY
+    from dm_calibration.calibration_parameters import CRITERIA
     from dm_calibration.report.certificate import keep_people, people
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
@@ -112,7 +112,7 @@ def report(
             raise ValueError(f"no calibration in {folders}: calibrate first (./dm calibrate), or name its --store")
     found, file = find_calibration(calibration, CalibrationStore(store))
     if found.mirror_serial != serial:
-        values = JUDGED_BY  # the parameters of the running suite are another mirror's
+        values = CRITERIA  # the parameters of the running suite are another mirror's
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
     if console.is_terminal and sys.stdin.isatty():
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
