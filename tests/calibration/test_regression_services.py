@@ -279,7 +279,7 @@ def test_a_refusal_that_passes_does_not_end_the_forecast(observer: Observer, mon
 
     def refused() -> bool:
         client.use(active, 2e-8)
-        return bool(client._told)
+        return bool(client._last_message)
 
     def known() -> bool:
         client.use(active, 2e-8)

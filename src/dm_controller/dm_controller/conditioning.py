@@ -71,7 +71,7 @@ class Conditioning:
             return 0.0
         return half_span * ((steps or STEPS_ASSUMED) + 2) / slew_rate
 
-    def prospect(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
+    def expected_degauss(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
         """The degauss that a move would wait for: the one under way, or a new one of `configured` half-swings."""
         run = self.run
         if run is None:
@@ -123,10 +123,10 @@ class Conditioning:
                 return None
             return Refusal(ErrorCode.TIMEOUT, "conditioning: the driver did not report the degauss as complete")
         # A driver that is killed or stopped never answers; its successor knows nothing of the degauss.
-        gone = "pdm_driver was restarted" if monitor.starts != run.starts else monitor.stopped(now)
-        if not gone and now - run.began > timeout:
-            gone = f"degauss: no answer within {timeout:g} s"
-        return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone}") if gone else None
+        cause = "pdm_driver was restarted" if monitor.starts != run.starts else monitor.stopped(now)
+        if not cause and now - run.began > timeout:
+            cause = f"degauss: no answer within {timeout:g} s"
+        return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {cause}") if cause else None
 
     def end(self) -> Order | None:
         """Note that the degauss has ended; returns the order that waited for it."""

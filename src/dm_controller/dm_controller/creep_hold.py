@@ -57,7 +57,7 @@ class CreepHold:
         sent = order.command.sent.time
         return max(sent + self._values["hold.period"], order.checked + CHECK_SHARE * (order.checked - sent))
 
-    def not_taken(self) -> None:
+    def not_confirmed(self) -> None:
         """The driver has not taken the last command: go on holding the shape before it, if it is still there."""
         stood = self._monitor.stood
         self.end("the driver did not accept the command")
@@ -67,7 +67,7 @@ class CreepHold:
     def end(self, reason: str) -> None:
         """Leave the shape as it is, and forget the one before."""
         if (order := self._monitor.order) is not None:
-            order.stood = None
+            order.previous_order = None
             if order.creep_held:
                 order.creep_held, self.ended = False, reason
 

@@ -49,7 +49,7 @@ class DriverMonitor:
         latest: the driver's last report; None before the first.
         starts: number of times the driver was activated anew, as far as reports show.
         open_until: s, until when anybody may send commands without a `check`.
-        gone: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
+        loss: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -58,7 +58,7 @@ class DriverMonitor:
         self.latest: ActuatorState | None = None
         self.starts = 0
         self.open_until = -math.inf
-        self.gone = ""
+        self.loss = ""
         self._heard = 0.0
         # s: ROS minus steady time, and how far stamps are ahead of each; infinite until known, which shows no gain.
         self._drift, self._ahead = math.inf, (math.inf, math.inf)
@@ -71,31 +71,31 @@ class DriverMonitor:
         return statistics.median(self._latencies) if self._latencies else 0.0
 
     @property
-    def stood(self) -> Order | None:
+    def previous_order(self) -> Order | None:
         """The previous order, while the driver holds its shape and has not taken the last order's first command."""
-        stood, report = self.order.stood if self.order is not None else None, self.latest
-        if stood is None or stood.command is None or report is None:
+        previous, report = self.order.previous_order if self.order is not None else None, self.latest
+        if previous is None or previous.command is None or report is None:
             return None
-        return stood if same_signals(report.requested, stood.command.signals) else None
+        return previous if same_signals(report.requested, previous.command.signals) else None
 
     @property
     def shape(self) -> Order | None:
         """The last order, if the driver reports its shape, with or without the latest creep correction; else None."""
         order, report = self.order, self.latest
-        if order is None or order.move is None or not order.kept or report is None:
+        if order is None or order.move is None or order.stopped or report is None:
             return None
         commands = [each for each in (order.command, order.earlier) if each is not None]
         return order if any(same_signals(report.requested, each.signals) for each in commands) else None
 
     def lost(self, reason: str) -> None:
         """Note what happened to a driver that is known to be dead, as a sentence; "" = it may live."""
-        self.gone = reason
+        self.loss = reason
         self._trust()  # a parameter may have changed, too
 
     def observe(self, report: ActuatorState, now: float) -> bool:
         """Take the driver's next report; returns True if it is the first to make the latency known."""
         before, self.latest, self._heard = self.latest, report, now
-        self.gone = ""  # a driver that reports is alive
+        self.loss = ""  # a driver that reports is alive
         anew = before is not None and report.sequence < before.sequence
         self.starts += anew
         self._trust()
@@ -128,12 +128,12 @@ class DriverMonitor:
     def _trust(self) -> None:
         report, limit = self.latest, self._values["driver_timeout"] or math.inf
         is_open = report is not None and report.driver_state == ActuatorState.STATE_ACTIVE and not report.holder
-        self.open_until = self._heard + limit if is_open and not self.gone else -math.inf
+        self.open_until = self._heard + limit if is_open and not self.loss else -math.inf
 
     def silent(self, now: float) -> str:
         """Why the driver counts as silent, as a sentence; "" = it reports, or never did."""
-        if self.gone:
-            return self.gone
+        if self.loss:
+            return self.loss
         limit = self._values["driver_timeout"]
         age = now - self._heard
         if self.latest is None or not limit or age <= limit:
@@ -146,7 +146,7 @@ class DriverMonitor:
         if report is None:
             text = "no actuator_state from pdm_driver yet: is the driver running?"
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, text)
-        if report.driver_state != ActuatorState.STATE_ACTIVE and not self.gone:
+        if report.driver_state != ActuatorState.STATE_ACTIVE and not self.loss:
             return _not_active(report)
         if silent := self.silent(now):
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
@@ -170,21 +170,21 @@ class DriverMonitor:
         if order is None or order.command is None or order.answered or not (order.command.confirmed or replaced):
             return []
         order.answered, order.applied = True, order.command.confirmed
-        order.stood = None if order.applied else order.stood
+        order.previous_order = None if order.applied else order.previous_order
         order.refusal = None if order.applied else Refusal(ErrorCode.PREEMPTED, replaced)
         return [PublishState(order)]
 
     def stopped(self, now: float) -> str:
         """The reason why the driver cannot finish what it has begun; "" = it can: a lost link comes back."""
         report = self.latest
-        if report is not None and report.driver_state in _STOPPED and not self.gone:
+        if report is not None and report.driver_state in _STOPPED and not self.loss:
             return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
         return self.silent(now)
 
     def keeps(self, order: Order) -> bool:
         """Whether the last command keeps the shape of `order`, possibly corrected for creep."""
         last = self.order
-        if order.move is None or last is None or last.move is None or not last.kept:
+        if order.move is None or last is None or last.move is None or last.stopped:
             return False
         return same_signals(order.move.signals, last.move.signals)
 
@@ -213,7 +213,7 @@ class DriverMonitor:
             share = 1.0 - gap / order.gap if order.gap else 1.0
             ours = any(same_signals(report.requested, own) for own in (signals, last.signals))
             if ours and not report.moving:
-                return Progress(share=1.0, remaining=gap, stands=True)
+                return Progress(share=1.0, remaining=gap, reached=True)
             if not ours and order.starts != self.starts:
                 return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver was restarted meanwhile"))
             if not ours and (last.confirmed or last.given_up):
@@ -224,7 +224,7 @@ class DriverMonitor:
             return Progress(failed=Refusal(ErrorCode.TIMEOUT, text or "the driver did not report the shape"))
         return Progress(share=share, remaining=gap)
 
-    def untaken(self, now: float) -> Refusal | None:
+    def unconfirmed(self, now: float) -> Refusal | None:
         """The reason why the driver has not confirmed the last command in time, once; None = there is none.
 
         Only the latest command counts, as at the driver.
@@ -233,7 +233,7 @@ class DriverMonitor:
         if command is None or command.confirmed or command.given_up:
             return None
         limit = self._values["driver_timeout"] or CONFIRM_S
-        if not (command.lost or self.gone or now - command.sent.steady > limit):
+        if not (command.lost or self.loss or now - command.sent.steady > limit):
             return None
         command.given_up = True
         text = "the driver has not confirmed the command"

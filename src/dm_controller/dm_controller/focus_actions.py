@@ -198,7 +198,7 @@ class MoveFocusAction:
         next_feedback = 0.0
         while True:
             progress = self._progress(order)
-            if progress.stands:
+            if progress.reached:
                 return None
             if progress.failed is not None:
                 return "abort", progress.failed.error_code, str(progress.failed)

@@ -108,7 +108,7 @@ class FocusController:
             self.observer.observe(applied_from(report, now.time), gain)
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
-        elif self.hold.active and self.monitor.stood is None:
+        elif self.hold.active and self.monitor.previous_order is None:
             self.hold.driver_requested(report.requested, now.steady)
         self._at_rest = None if report.moving else self.observer.estimate(now.time)
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
@@ -149,7 +149,7 @@ class FocusController:
         order = Order(request, now)
         return order, self._attempt(order, now, dry_run)
 
-    def judge(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:
+    def move_for(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:
         """The move that a request asks for, from the mirror as it is.
 
         Args:
@@ -173,7 +173,7 @@ class FocusController:
         if degaussed is not None:
             degauss = Degauss(degaussed, True, 0.0)
         elif self.conditioning.run is not None or request.mode == FocusRequest.MODE_CONDITIONED or budget:
-            degauss = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
+            degauss = self.conditioning.expected_degauss(active, values["condition.degauss_steps"], now.steady)
         else:  # no time for a degauss: at once, from the present state
             return active.planner.plan(target, estimate.state, now.time, not estimate.unknown, ahead=settle)
         context = PlanningContext(active, estimate, now.time, settle, degauss)
@@ -185,7 +185,7 @@ class FocusController:
         order.unknown = (self._at_rest or self.observer).unknown
         order.creep_held = active is not None and self._values["hold.enable"] and active.planner.law.creep_rate > 0.0
         try:
-            move = order.move = self.judge(order.request, now, degaussed)
+            move = order.move = self.move_for(order.request, now, degaussed)
             tolerance = self._values["reachable_tolerance"]
             if not move.max_zernike <= tolerance:
                 assert active is not None  # else it is refused
@@ -222,7 +222,7 @@ class FocusController:
         if (before := self.monitor.order) is not None and before.command is not None:
             if not before.answered:
                 effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
-            order.stood = before if before.command.confirmed else before.stood
+            order.previous_order = before if before.command.confirmed else before.previous_order
         self.monitor.order = order
         return effects
 
@@ -264,26 +264,26 @@ class FocusController:
 
     # --- time ---
 
-    def tick(self, now: Moment, driver_gone: str = "") -> list[Effect]:
+    def tick(self, now: Moment, driver_loss: str = "") -> list[Effect]:
         """Do what is due: creep corrections, and refusals of what the driver did not take or does not finish.
 
-        `driver_gone`: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
+        `driver_loss`: what happened to a driver that is known to be dead, as a sentence; "" = it may live.
         """
-        self.monitor.lost(driver_gone)
+        self.monitor.lost(driver_loss)
         effects: list[Effect] = []
         if failure := self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady):
             effects += self._degauss_ended(now, failure)
         order = self.monitor.order
-        if order is not None and (untaken := self.monitor.untaken(now.steady)) is not None:
-            self.hold.not_taken()
+        if order is not None and (unconfirmed := self.monitor.unconfirmed(now.steady)) is not None:
+            self.hold.not_confirmed()
             # If the request was answered already, only a correction or the end of a move was not taken.
-            effects += [Log("warning", str(untaken))] if order.answered else self._refuse(order, untaken, now)
+            effects += [Log("warning", str(unconfirmed))] if order.answered else self._refuse(order, unconfirmed, now)
         effects += self._news(now)
         if not self.conditioning.run:  # a correction would end the degauss
             effects += self.hold.command(self.observer.estimate(now.time), now)
         return effects
 
-    def quick_ticks(self, now: Moment) -> bool:
+    def needs_fast_timer(self, now: Moment) -> bool:
         """Whether something can be due before `SLOW_PERIOD_S` has passed."""
         return self.conditioning.run is not None or self.hold.next_check - now.time <= SLOW_PERIOD_S
 
@@ -293,7 +293,7 @@ class FocusController:
         if last is None or not self.monitor.keeps(order):
             return None
         self.hold.end("the move was cancelled")
-        last.kept = False
+        last.stopped = True
         effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
         if report is not None and len(report.applied):
             effects.append(last.leave_at(np.array(report.applied), now))

@@ -139,8 +139,8 @@ class FocusControllerNode(FocusHost):
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
-            gone = f"pdm_driver {qos.LOST_TEXT}" if self._driver.missing() else ""
-            self.carry_out(controller.tick(now, gone), now)
+            loss = f"pdm_driver {qos.LOST_TEXT}" if self._driver.missing() else ""
+            self.carry_out(controller.tick(now, loss), now)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
@@ -173,7 +173,7 @@ class FocusControllerNode(FocusHost):
             else:
                 self.get_logger().error(effect.text)
         # Tick quickly only while something can be due soon: a lost driver counts as dead within 2 s.
-        if not (self._controller.quick_ticks(now) or (self._driver.lost and not self._driver.missing())):
+        if not (self._controller.needs_fast_timer(now) or (self._driver.lost and not self._driver.missing())):
             self._quick.cancel()
         elif self._quick.is_canceled():
             self._quick.reset()

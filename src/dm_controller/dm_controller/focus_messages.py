@@ -21,7 +21,7 @@ from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget
 
 #: What to do about an unknown history.
-CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
+REMEDY = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
 
 
 def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
@@ -78,7 +78,7 @@ def actuator_estimate_message(controller: FocusController) -> ActuatorEstimate:
 
 def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], now_ns: int) -> str:
     """What makes predictions worse than they could be, as sentences; "" = nothing."""
-    history = f"the history of the actuators is not known ({unknown}): {CURE}" if unknown else ""
+    history = f"the history of the actuators is not known ({unknown}): {REMEDY}" if unknown else ""
     stale = active.stale(now_ns, values["calibration_age_max"])
     return "; ".join(filter(None, (history if active.planner.hysteresis is not None else "", stale)))
 
@@ -87,7 +87,7 @@ def nowhere(active: ActiveCalibration, tolerance: float) -> str:
     """A sentence if no sphere is reachable within `tolerance` (m); "" = some are."""
     flat = FocusTarget(0.0)
     reachable = active.reachable_range(flat, tolerance)
-    return flat.denied(active.certain.command(flat)[1], tolerance, reachable) if math.isnan(reachable[0]) else ""
+    return flat.denied(active.worst_case.command(flat)[1], tolerance, reachable) if math.isnan(reachable[0]) else ""
 
 
 def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment) -> str:

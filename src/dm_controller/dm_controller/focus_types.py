@@ -75,8 +75,8 @@ class Order:
         earlier: the last confirmed command before `command`, which the driver follows until `command` arrives.
         creep_held: its shape is corrected for creep, from its command until the hold ends.
         checked: s, ROS time, of the last check for creep.
-        stood: the order before, whose shape is held until the driver takes the first command of this one; None = none.
-        kept: its move was not stopped.
+        previous_order: its shape is held until the driver takes the first command of this one; None = none.
+        stopped: its move was stopped.
         starts: number of times that the driver had been activated anew when its first command was sent.
     """
 
@@ -94,8 +94,8 @@ class Order:
     earlier: SendCommand | None = None
     creep_held: bool = False
     checked: float = 0.0
-    stood: Order | None = None
-    kept: bool = True
+    previous_order: Order | None = None
+    stopped: bool = False
     starts: int = 0
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
@@ -117,14 +117,14 @@ class Progress(NamedTuple):
         planning: the mirror is being degaussed for it.
         share: 0 to 1, of the degauss or of the move.
         remaining: normalised distance to the shape.
-        stands: the driver reports the shape.
+        reached: the driver reports the shape.
         failed: the refusal that ended it; None = it goes on.
     """
 
     planning: bool = False
     share: float = 0.0
     remaining: float = 0.0
-    stands: bool = False
+    reached: bool = False
     failed: Refusal | None = None
 
 

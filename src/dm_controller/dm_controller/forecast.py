@@ -69,8 +69,8 @@ class ForecastClient:
         self._node = node
         self._client = node.create_client(PredictError, "predict_error")
         self._calibration_id = ""
-        self._asked_at = -float("inf")
-        self._refused, self._told = False, ""
+        self._requested_at = -float("inf")
+        self._refused, self._last_message = False, ""
         self._pending: list[Any] = []
 
     def use(self, active: ActiveCalibration | None, tolerance: float) -> None:
@@ -87,15 +87,15 @@ class ForecastClient:
         calibration_id = active.calibration.id if active is not None else ""
         if calibration_id != self._calibration_id:
             self._calibration_id, self._refused, self.share = calibration_id, False, None
-            self._asked_at = -float("inf")
+            self._requested_at = -float("inf")
         if active is None or self.share is not None or self._refused or not self._client.service_is_ready():
             return
-        if time.monotonic() < self._asked_at + RETRY_S:
+        if time.monotonic() < self._requested_at + RETRY_S:
             return
         mirror, curvatures = active.mirror, active.reachable_range(FocusTarget(0.0), tolerance)
         if not np.isfinite(curvatures).all():
             return
-        self._asked_at = time.monotonic()
+        self._requested_at = time.monotonic()
         for future in self._pending:
             self._client.remove_pending_request(future)
         self._pending = []
@@ -117,8 +117,8 @@ class ForecastClient:
             return
         answer = future.result()
         if answer.error_code != ErrorCode.OK:
-            if answer.message != self._told:
-                self._told = answer.message
+            if answer.message != self._last_message:
+                self._last_message = answer.message
                 self._node.get_logger().info(f"no prediction of the surface error: {answer.message}")
             self._refused = self._refused or answer.error_code in FINAL
             return

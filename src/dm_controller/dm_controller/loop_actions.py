@@ -57,7 +57,7 @@ class LoopBench(BenchServices):
         name: str,
         handle: WorkerGoal,
         feedback: Any,
-        asked: Any,
+        request: Any,
         body: Callable[[], tuple[int, str]],
         needed: qos.Liveliness | None = None,
         history: bool = False,
@@ -67,20 +67,20 @@ class LoopBench(BenchServices):
         Cancelling the goal ends waits, and its feedback names them.
 
         Args:
-            asked: the goal or request, which names the client, see `BenchServices.held`.
+            request: the goal or request, which names the client, see `BenchServices.held`.
             needed: a node that the goal needs besides driver and interferometer.
             history: whether a map is valid only if the driver has known the actuators' history since the degauss.
         """
         busy = "a closed loop or a run of recipes is under way; cancel it first, or take the mirror over"
         timeout = self.parameters["converge.driver_timeout"]
         try:
-            self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
+            self.hold.wait_for(lambda: self._goal.acquire(blocking=False), request, busy, timeout)
             try:
                 self._values, self._needed, self._by_history = loop_times(self.parameters), needed, history
                 self.settle_time = self._values["settle_time"]
                 self.cancelled = lambda: bool(handle.is_cancel_requested)
                 self.publish_waits(handle, feedback)
-                with self.held(asked, f"{BUSY[name]}; cancel it to end it"):
+                with self.held(request, f"{BUSY[name]}; cancel it to end it"):
                     code, text = body()
             finally:
                 self._goal.release()

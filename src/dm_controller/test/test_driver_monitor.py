@@ -65,7 +65,7 @@ def test_reports_grow_old(timeout: float, refused: bool) -> None:
 def test_a_command_that_is_confirmed_is_not_told_of() -> None:
     driver = monitor()
     driver.observe(report(THERE), BEGAN + 0.5)
-    assert driver.untaken(BEGAN + 10.5) is None
+    assert driver.unconfirmed(BEGAN + 10.5) is None
 
 
 @pytest.mark.parametrize(
@@ -81,15 +81,15 @@ def test_a_command_that_is_confirmed_is_not_told_of() -> None:
 )
 def test_a_command_that_is_not_confirmed_is_told_of_once(last: ActuatorState | None, code: int, text: str) -> None:
     driver = monitor()
-    assert driver.untaken(BEGAN) is None
+    assert driver.unconfirmed(BEGAN) is None
     later = BEGAN + TIMEOUT + 0.1
     if last is not None:
         driver.observe(last, later)
-    refusal = driver.untaken(later)
+    refusal = driver.unconfirmed(later)
     assert refusal is not None
     assert refusal.error_code == code
     assert text in str(refusal)
-    assert driver.untaken(later) is None
+    assert driver.unconfirmed(later) is None
 
 
 def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_nothing() -> None:
@@ -100,8 +100,8 @@ def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_not
     driver = monitor(timeout=0.0)
     assert driver.order is not None and driver.order.command is not None
     driver.order.command.sent = Moment(10**9, 1.0, BEGAN + 1.0)  # no report has come since
-    untaken = driver.untaken(BEGAN + 1.0 + 1.1 * CONFIRM_S)
-    assert untaken is not None and untaken.error_code == ErrorCode.TIMEOUT
+    unconfirmed = driver.unconfirmed(BEGAN + 1.0 + 1.1 * CONFIRM_S)
+    assert unconfirmed is not None and unconfirmed.error_code == ErrorCode.TIMEOUT
 
 
 def test_a_driver_that_was_started_anew_is_noticed() -> None:
@@ -126,10 +126,10 @@ def test_a_command_that_a_driver_started_anew_cannot_know_is_lost_at_once(
     driver = monitor()
     driver.observe(report(sequence=7), BEGAN)
     driver.observe(report(sequence=1, driver_state=state, stamp_ns=stamp_ns), BEGAN + 0.1)
-    untaken = driver.untaken(BEGAN + 0.1)
-    assert (untaken is not None) == lost
-    if untaken is not None:
-        assert untaken.error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(untaken)
+    unconfirmed = driver.unconfirmed(BEGAN + 0.1)
+    assert (unconfirmed is not None) == lost
+    if unconfirmed is not None:
+        assert unconfirmed.error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(unconfirmed)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_command_that_a_driver_started_anew_cannot_know_is_lost_at_once(
 def test_a_shape_that_a_restarted_driver_has_left_was_not_taken_over(sequence: int, code: int, text: str) -> None:
     driver = monitor()
     driver.observe(report(THERE, sequence=7), BEGAN + 0.1)
-    assert driver.order is not None and driver.progress(driver.order, BEGAN + 0.1).stands
+    assert driver.order is not None and driver.progress(driver.order, BEGAN + 0.1).reached
     driver.observe(report(np.zeros(37), sequence=sequence, stamp_ns=2 * 10**9), BEGAN + 0.5)
     failed = driver.progress(driver.order, BEGAN + 0.5).failed
     assert failed is not None and failed.error_code == code and text in str(failed)

@@ -256,7 +256,7 @@ def test_a_request_becomes_a_command_and_then_a_state(bench: Bench) -> None:
     bench.do(effects)
     assert [outcome.request for outcome in bench.outcomes] == [order.request]
     assert bench.outcomes[0].applied and bench.outcomes[0].creep_held and bench.outcomes[0].unknown == ""
-    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert bench.controller.monitor.progress(order, bench.time).reached
     assert bench.controller.monitor.latency == 0.0
     bench.time += 0.05
     assert bench.error(move_of(order).effective) < 1e-6
@@ -426,7 +426,7 @@ def test_actuators_without_a_channel_are_neither_corrected_nor_kept_where_they_r
     bench.unused[-1] = True
     bench.degauss()
     order = bench.ask(0.03)
-    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert bench.controller.monitor.progress(order, bench.time).reached
     bench.wait(60.0)
     assert len(bench.commands) > 2 and bench.controller.hold.active
     first, *corrections = [command.signals for command in bench.commands]
@@ -451,7 +451,7 @@ def test_the_newest_request_wins(bench: Bench) -> None:
     assert len(bench.commands) == 2
     failed = bench.controller.monitor.progress(first, bench.time).failed
     assert failed is not None and failed.error_code == ErrorCode.PREEMPTED
-    assert bench.controller.monitor.progress(second, bench.time).stands
+    assert bench.controller.monitor.progress(second, bench.time).reached
     assert bench.controller.stop(first, bench.now) is None
     bench.do(bench.controller.stop(second, bench.now) or [])
     assert not bench.controller.hold.active
@@ -657,7 +657,7 @@ def test_a_degauss_on_the_way(bench: Bench) -> None:
     assert bench.commands == []  # the report is still to come
     bench.degauss()
     assert len(bench.commands) == 1 and bench.outcomes[-1].applied and bench.outcomes[-1].unknown == ""
-    assert not order.pending and bench.controller.monitor.progress(order, bench.time).stands
+    assert not order.pending and bench.controller.monitor.progress(order, bench.time).reached
     active = bench.controller.active
     assert active is not None and bench.controller.conditioning.duration(0, active) == 2.0
     slower = copy(MIRROR)
@@ -911,7 +911,7 @@ def test_a_held_shape_is_corrected_for_creep(bench: Bench) -> None:
     effective = move_of(order).effective
     drifted = np.abs(LAW.effective(LAW.advance(left_alone, bench.time)) - effective).max()
     assert bench.error(effective) < 0.05 * drifted
-    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert bench.controller.monitor.progress(order, bench.time).reached
     assert len(bench.outcomes) == 1
     bench.obeys, sent = False, len(bench.commands)
     while len(bench.commands) == sent:
@@ -919,9 +919,9 @@ def test_a_held_shape_is_corrected_for_creep(bench: Bench) -> None:
         bench.report()
         bench.do(bench.controller.tick(bench.now))
     under_way = bench.controller.monitor.progress(order, bench.time)
-    assert not under_way.stands and under_way.failed is None
+    assert not under_way.reached and under_way.failed is None
     bench.move(bench.commands[-1].signals)
-    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert bench.controller.monitor.progress(order, bench.time).reached
 
 
 def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) -> None:

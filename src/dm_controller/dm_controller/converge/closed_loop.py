@@ -82,7 +82,7 @@ class Creep:
         """Note that the plant has just gone to `signals` (N,)."""
         self._state = self._law.move(self._state, signals, self._now())
 
-    def foreseen(self) -> Floats:
+    def predicted_change(self) -> Floats:
         """(N,) predicted change of the effective signals until the next map."""
         law, now = self._law, self._now()
         self._state = law.advance(self._state, now)
@@ -142,13 +142,13 @@ class StoppedLoop(Cancelled):
         super().__init__(f"cancelled after {maps} maps; the mirror holds the last command")
 
 
-def response_ratio(asked: Shape, seen: Shape) -> float:
+def response_ratio(commanded: Shape, measured: Shape) -> float:
     """Ratio of measured to commanded change, by least squares over coefficients beyond tilt; NaN if too little moved.
 
     Coefficients are weighted by their rms sag.
     """
-    factors = TERM_RMS[PISTON_TILT : len(asked.coefficients)]
-    wanted, got = factors * asked.coefficients[PISTON_TILT:], factors * seen.coefficients[PISTON_TILT:]
+    factors = TERM_RMS[PISTON_TILT : len(commanded.coefficients)]
+    wanted, got = factors * commanded.coefficients[PISTON_TILT:], factors * measured.coefficients[PISTON_TILT:]
     power = float(wanted @ wanted)
     return float(wanted @ got) / power if math.sqrt(power) >= CHANGE_MIN else math.nan
 
@@ -197,8 +197,8 @@ def converge(
         error = measured_shape(measured.coefficients, measured.sag, model) - wanted
         step = LoopStep(number, signals, error, error.max_zernike, rms_sag(error, model))
         if steps:
-            asked = response(model, signals - steps[-1].signals)
-            ratio = response_ratio(asked, error - steps[-1].error - drift)
+            commanded = response(model, signals - steps[-1].signals)
+            ratio = response_ratio(commanded, error - steps[-1].error - drift)
             if math.isfinite(ratio):
                 scale = float(np.clip(1.0 / ratio, SCALE_MIN, SCALE_MAX)) if ratio > 0.0 else SCALE_MIN
             if step.max_zernike > steps[-1].max_zernike + CHANGE_MIN:
@@ -215,7 +215,7 @@ def converge(
         if converged or (used_up and not options.correct_last):
             break
         if creep is not None:
-            drift = response(model, creep.foreseen())
+            drift = response(model, creep.predicted_change())
         better, limits = solver.correct(signals, error + drift).signals, solver.limits
         further = np.clip(signals + scale * damping * (better - signals), limits.low, limits.high)
         # A longer step is clipped to the range, but not scaled for the neighbours: that would shrink the whole shape.

@@ -30,7 +30,7 @@ from dm_controller.planning.recipes import recipe_targets
 STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
 #: Time for the calibration node to judge the last map, half a second after its stamp, and to publish the result, s.
-JUDGED_S = 2.0
+UPDATE_S = 2.0
 
 
 class RecipeRun:
@@ -100,7 +100,7 @@ class RecipeRun:
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
-            time.sleep(JUDGED_S)
+            time.sleep(UPDATE_S)
             now = self._planner_now(active)
             book = recipe_book(recipes, now, steps, round(1e9 * bench.now()), active.recipes)
             result.interpolation_error = book.interpolation_error
@@ -154,13 +154,13 @@ class RecipeRun:
         deadline = time.monotonic() + RETURN_S
         while True:
             self._calibration.wait_for_return(lambda: bool(handle.is_cancel_requested))
-            gone = self._calibration.since_now(self._store.service_is_ready)
+            lost_reason = self._calibration.since_now(self._store.service_is_ready)
             try:
-                response = call(self._store, request, STORE_TIMEOUT_S, gone)
+                response = call(self._store, request, STORE_TIMEOUT_S, lost_reason)
                 code, text = response.error_code, response.message
                 wait = code == ErrorCode.NOT_CALIBRATED
             except ServiceCallError as error:
-                code, text = ErrorCode.TIMEOUT, gone() or str(error)
+                code, text = ErrorCode.TIMEOUT, lost_reason() or str(error)
                 wait = True
             lost = self._bench.hold.lost is not None  # somebody else has taken the mirror over: end the wait
             if not wait or lost or handle.is_cancel_requested or time.monotonic() > deadline:

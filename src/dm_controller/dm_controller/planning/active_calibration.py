@@ -40,14 +40,14 @@ class ActiveCalibration:
     Attributes:
         calibration: as received.
         mirror: its influence function inside the limits.
-        certain: the same inside limits that the effective signals can reach from any history.
+        worst_case: the same inside limits that the effective signals can reach from any history.
         planner: of its moves.
         recipes: may be empty.
     """
 
     calibration: Calibration
     mirror: CalibratedMirror
-    certain: CalibratedMirror
+    worst_case: CalibratedMirror
     planner: Planner
     recipes: RecipeBook
 
@@ -58,7 +58,7 @@ class ActiveCalibration:
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """See :meth:`CalibratedMirror.reachable_range`; only what can be reached from any history."""
-        return self.certain.reachable_range(target, tolerance)
+        return self.worst_case.reachable_range(target, tolerance)
 
     def degauss_steps(self, configured: int) -> int:
         """Half-swings of the conditioning degauss: `configured`, else as for the recipes; 0 = the driver's own."""
@@ -145,14 +145,14 @@ def active_calibration(
         if any(len(recipe.effective) != calibration.actuators for recipe in book.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
-        certain = calibrated
+        worst_case = calibrated
         if not planner.law.is_identity:
             from dm_common.hysteresis.law_shape import worst_case_limits  # not imported at the start
 
-            certain = CalibratedMirror(model, worst_case_limits(planner.law, limits), hold_tilt, axis)
+            worst_case = CalibratedMirror(model, worst_case_limits(planner.law, limits), hold_tilt, axis)
     except ValueError as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
-    return ActiveCalibration(calibration, calibrated, certain, planner, book)
+    return ActiveCalibration(calibration, calibrated, worst_case, planner, book)
 
 
 def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Floats | None = None) -> InfluenceModel:

@@ -174,7 +174,7 @@ class PreparedInverse:
         signals, apart, left = self.state.signals, self._apart, np.inf
         for _ in range(LAG_ROUNDS):
             wanted = self._law.static_of(effective, grown, faded + followed * apart)
-            signals = self._looked_up(wanted)
+            signals = self._from_table(wanted)
             before, apart = apart, signals - wanted
             last, left = left, np.maximum.reduce(np.abs(followed * (apart - before)))
             if not LAG_LEFT < left < last:  # as in `invert`; also for NaN
@@ -183,7 +183,7 @@ class PreparedInverse:
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
         return np.asarray(signals) if inside and self._limits.allow_neighbours(signals) else None
 
-    def _looked_up(self, wanted: Floats) -> Floats:
+    def _from_table(self, wanted: Floats) -> Floats:
         """Signals (N,) for static effective signals; NaN where a piece is not exact."""
         places = np.where(wanted >= self.state.position, self._rising + wanted, self._falling - wanted)
         piece = self._table[self._places.searchsorted(places, "right") - 1].T

@@ -205,10 +205,10 @@ class CalibratedMirror:
             (R,) or (R, N); R = K - 3 + P, and 2 more where tilt is held.
         """
         weighted = self._coefficient_rows @ shape.coefficients[PISTON_TILT:]
-        kept = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
+        tilt_rows = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
         if tilt is not None and self.tilt is not None:
-            kept = TILT_WEIGHT * tilt
-        return np.concatenate([kept, weighted, reduced(shape.sag, self._weights, self._terms)])
+            tilt_rows = TILT_WEIGHT * tilt
+        return np.concatenate([tilt_rows, weighted, reduced(shape.sag, self._weights, self._terms)])
 
     def solve(self, rows: Floats) -> Floats:
         """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.

@@ -35,7 +35,7 @@ DRAWS = 4000
 #: Largest coefficient error of a sphere that counts as within the range of the mirror, m.
 RANGE_TOLERANCE = 20e-9
 #: Error of an effective signal, normalised, above which a limit counts as binding.
-MISSED_MAX = 1e-6
+RESIDUAL_MAX = 1e-6
 #: Factor by which the bound of creep must exceed that of all other errors for creep to be named as its main source.
 MUCH = 2.0
 
@@ -159,16 +159,16 @@ class Planner:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         # A move's creep counts from its last write; older creep goes on during the move.
         begun, arrival = state, time + travel
-        signals, missed = aim, None
+        signals, residual = aim, None
         if self.hysteresis is not None or effective is not None:
-            signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None, cut)
+            signals, residual = self._inverted(begun, arrival, aim, ahead, target if effective is None else None, cut)
         reached = aim
-        if missed is not None and np.abs(missed).max() > MISSED_MAX:
+        if residual is not None and np.abs(residual).max() > RESIDUAL_MAX:
             if effective is None:
-                reached = aim - missed
+                reached = aim - residual
                 largest = mirror.predict(target, reached).max_zernike
             else:
-                denied, own = self._largest(missed), None if own is None else own - missed
+                denied, own = self._largest(residual), None if own is None else own - residual
                 largest, error = largest + denied, None if error is None else error + denied
 
         def predict() -> Plan:
@@ -184,8 +184,8 @@ class Planner:
         def drift() -> tuple[float, float]:
             if not law.creep_rate:
                 return 0.0, 0.0
-            stands = law.move(law.advance(begun, arrival), signals, arrival)
-            return self._creep_error.drift(stands, aim if missed is None else aim - missed)
+            at_arrival = law.move(law.advance(begun, arrival), signals, arrival)
+            return self._creep_error.drift(at_arrival, aim if residual is None else aim - residual)
 
         return Move(target, signals, reached, largest, known, travel + ahead, predict, drift)
 
@@ -210,7 +210,7 @@ class Planner:
                 return found, None
         at = self.law.advance(state, arrival)
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
-        if not cut and np.abs(inverted.residual).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
+        if not cut and np.abs(inverted.residual).max() <= RESIDUAL_MAX and limits.allow_neighbours(inverted.signals):
             return inverted.signals, None
         wanted = self.mirror.matrix @ aim if target is None else self.mirror.rows(*self.mirror.wanted(target))
         signals, reached = self._constrained.solve(at, wanted, ahead, inverted.signals)
