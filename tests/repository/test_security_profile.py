@@ -52,7 +52,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
             wait_until(lambda: client.node.count_publishers("surface_map"), 60.0)
             client.measure_map()  # its subscriptions are made when they are needed
             hear_health(client)  # as `dm status` and `dm check` do
-            client.hear("recipes", RecipeBook, qos.LATCHED)  # as `dm recipes` does
+            client.subscribe("recipes", RecipeBook, qos.LATCHED)  # as `dm recipes` does
             yield client
         finally:
             side.close()
@@ -82,10 +82,10 @@ def test_the_policy_is_what_the_node_uses_and_nothing_more(bench: DeformableMirr
 
 def test_only_the_interferometer_hears_a_sensor_and_only_where_there_is_one() -> None:
     profile = Profile("left", sensor="wavefront/zernike")
-    hear = [
+    subscribers = [
         name for name in profile.enclaves() if "rt/left/wavefront/zernike" in dds_topics(profile, name)["subscribe"]
     ]
-    assert hear == ["interferometer"]
+    assert subscribers == ["interferometer"]
     assert "rt/left/wavefront/zernike" not in dds_topics(Profile("left"), "interferometer")["subscribe"]
 
 

@@ -133,7 +133,7 @@ class CameraFocusClient(DeformableMirrorClient):
         goal = filled(FocusStack.Goal, images=images, **_ends(curvature_range), **claim)
         topics = ("focus_stack/image", "focus_stack/depth")
         for topic in topics:
-            self.hear(topic, Image, qos.LATCHED)
+            self.subscribe(topic, Image, qos.LATCHED)
         result = self.run_action("focus_stack", goal, on_feedback, timeout_s)
         image, depth = (pixels_of(self.stamped(topic, result.stamp)) for topic in topics)
         return result, image, depth[..., 0]
@@ -167,7 +167,7 @@ class CameraFocusClient(DeformableMirrorClient):
             raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, str(error)) from error
         topics = {image_topic: Image, f"{image_topic}/compressed": CompressedImage}
         for topic, kind in topics.items():
-            self.hear(topic, kind, IMAGES)
+            self.subscribe(topic, kind, IMAGES)
         focus = self.autofocus(part, **claim).curvature
         reach = self.focus_range()
         step = STEP * reach.curvature_tolerance
@@ -180,8 +180,8 @@ class CameraFocusClient(DeformableMirrorClient):
             begin = seconds_of(state.header.stamp) + state.predicted_duration + SETTLE_S + stamp_lead
 
             def fresh() -> list[Any]:
-                came = [self.messages[topic] for topic in topics if topic in self.messages]
-                return [image for image in came if seconds_of(image.header.stamp) >= begin]
+                received = [self.messages[topic] for topic in topics if topic in self.messages]
+                return [image for image in received if seconds_of(image.header.stamp) >= begin]
 
             if not self.wait(lambda: bool(fresh())):
                 raise DeformableMirrorError(

@@ -24,15 +24,15 @@ def test_it_tracks_from_the_end_of_the_search_on(lost_after: float | None, monke
     monkeypatch.setattr(camera_client, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def run_action(
-        _name: str, goal: Any, hear: Callable[[Any], None], _limit: float, enough: Callable[[], bool]
+        _name: str, goal: Any, on_feedback: Callable[[Any], None], _limit: float, enough: Callable[[], bool]
     ) -> None:
         assert goal.track
         now[0] += 20.0
-        hear(SimpleNamespace(phase=AutofocusState.PHASE_COARSE))
+        on_feedback(SimpleNamespace(phase=AutofocusState.PHASE_COARSE))
         assert not enough(), "a search takes as long as it takes"
         begun = now[0]
         while not enough():
-            hear(SimpleNamespace(phase=AutofocusState.PHASE_TRACK))
+            on_feedback(SimpleNamespace(phase=AutofocusState.PHASE_TRACK))
             now[0] += 0.5
             if lost_after is not None and now[0] - begun > lost_after:
                 raise DeformableMirrorError(ErrorCode.DRIVER_INACTIVE, "no more")
@@ -82,7 +82,7 @@ def test_the_axis_is_found_by_images_exposed_after_the_move(
     played = {
         "autofocus": lambda *_region: SimpleNamespace(curvature=0.0),
         "focus_range": lambda: reach,
-        "hear": lambda *_topic: True,
+        "subscribe": lambda *_topic: True,
         "focus": lambda *_curvature, **_shape: state,
         "wait": lambda condition: condition(),
         "messages": {"image_raw": image},

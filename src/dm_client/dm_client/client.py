@@ -205,7 +205,7 @@ class DeformableMirrorClient(Connection):
 
     def measure_map(self, label: str = "", timeout_s: float = 0.0) -> tuple[Measure.Response, Image]:
         """Take one map, and return the map itself as well (sensor_msgs/Image, 32FC1, m)."""
-        if self.hear("surface_map", Image, qos.MAP):
+        if self.subscribe("surface_map", Image, qos.MAP):
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
             time.sleep(0.3)  # the publisher must have discovered this subscription too
         response = self.measure(label, timeout_s)

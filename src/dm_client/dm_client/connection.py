@@ -122,11 +122,11 @@ class Connection:
         rules = ["--ros-args", "-r", f"__node:={own}", "-r", f"__ns:={place}"]
         self.node = Node(own, namespace=place, context=self._context, cli_args=rules)
         self.messages: dict[str, Any] = {}
-        self._heard: set[str] = set()
+        self._subscribed: set[str] = set()
         self._on_message, self._timeout_s = on_message, timeout_s
         self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
-            self.hear(topic, message_type, profile)
+            self.subscribe(topic, message_type, profile)
         self._servers: dict[str, Liveliness] = {}
         for server, (message_type, topic, profile, served) in watched.items():
             self._servers |= dict.fromkeys(served, qos.watch(self.node, server, message_type, topic, profile))
@@ -151,15 +151,15 @@ class Connection:
         self._background.destroy_node()
         self._context.try_shutdown()
 
-    def hear(self, topic: str, message_type: Any, profile: Any) -> bool:
+    def subscribe(self, topic: str, message_type: Any, profile: Any) -> bool:
         """Keep the latest message of a topic from now on; False = it is already kept.
 
         Raises DeformableMirrorError if the topic's name is not valid.
         """
         self._check_open()
-        if topic in self._heard:
+        if topic in self._subscribed:
             return False
-        self._heard.add(topic)
+        self._subscribed.add(topic)
 
         def take(message: Any) -> None:
             self.messages[topic] = message
@@ -168,7 +168,7 @@ class Connection:
         try:
             self.node.create_subscription(message_type, topic, take, profile)
         except InvalidTopicNameException as error:
-            self._heard.discard(topic)
+            self._subscribed.discard(topic)
             text = f"topic = {topic!r}: {str(error).splitlines()[0]}"
             raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
         return True

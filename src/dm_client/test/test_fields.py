@@ -114,5 +114,5 @@ def test_a_topic_that_cannot_be_is_refused(domain: int) -> None:
     with DeformableMirrorClient(domain=domain) as client:
         for _again in range(2):
             with pytest.raises(DeformableMirrorError, match="topic = 'a b': Invalid topic name") as refused:
-                client.hear("a b", MirrorInfo, 10)
+                client.subscribe("a b", MirrorInfo, 10)
             assert refused.value.error_code == ErrorCode.INVALID_ARGUMENT

@@ -32,7 +32,7 @@ def client(driver: int, able: int | None) -> DeformableMirrorClient:
     heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
     heard._background = SimpleNamespace(is_here=False)  # type: ignore[assignment]
     heard._context = SimpleNamespace(ok=lambda: True)
-    heard._heard = {"actuator_state", "capabilities"}
+    heard._subscribed = {"actuator_state", "capabilities"}
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
@@ -111,7 +111,7 @@ def test_a_topic_that_it_does_not_hear_is_named() -> None:
 
 def test_a_topic_that_is_heard_has_a_latest_message(domain: int) -> None:
     with DeformableMirrorClient(domain=domain) as mirror:
-        mirror.hear("recipes", RecipeBook, qos.LATCHED)
+        mirror.subscribe("recipes", RecipeBook, qos.LATCHED)
         publisher = mirror.node.create_publisher(RecipeBook, "recipes", qos.LATCHED)
         publisher.publish(RecipeBook(calibration_id="c1"))
         assert mirror.latest("recipes", 20.0).calibration_id == "c1"
@@ -150,7 +150,7 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
         ask(way)
     assert len(told) == 6 and all(text.endswith("the client has been closed") for text in told)
     with pytest.raises(DeformableMirrorError, match="the client has been closed"):
-        mirror.hear("another", ActuatorState, 1)
+        mirror.subscribe("another", ActuatorState, 1)
 
 
 def test_who_waits_hears_that_rclpy_was_shut_down(domain: int) -> None:

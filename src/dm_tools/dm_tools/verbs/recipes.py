@@ -115,7 +115,7 @@ def recipes(
     terms = [term for _ in wanted for shape in shapes for term in shape]
     wanted = [curvature for curvature in wanted for _ in shapes]
     with running_suite(namespace) as client, naming_holder(client):
-        client.hear("recipes", RecipeBook, qos.LATCHED)
+        client.subscribe("recipes", RecipeBook, qos.LATCHED)
         if not show:
             result = _build(
                 client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
