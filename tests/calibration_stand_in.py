@@ -82,7 +82,7 @@ class StandIn:
 
     def on_hold_mirror(self, request: Any, response: Any) -> Any:
         try:
-            self.hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+            self.hold.handle(request.operation, request.holder, request.purpose, request.duration, request.lease)
         except Refusal as refusal:
             response.error_code, response.message = refusal.error_code, str(refusal)
         response.holder = self.hold.holder

@@ -266,21 +266,21 @@ def test_what_waits_for_the_mirror_waits_until_the_map_can_be_judged(
     suite: Suite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite.shape()
-    ask = suite.bench.hold.ask
+    handle = suite.bench.hold.handle
 
     def move_when_released(operation: str, *rest: Any) -> None:
-        ask(operation, *rest)
+        handle(operation, *rest)
         if operation == HoldMirror.Request.RELEASE:
             suite.bench.move(suite.bench.mirror.rest)
 
-    monkeypatch.setattr(suite.bench.hold, "ask", move_when_released)
+    monkeypatch.setattr(suite.bench.hold, "handle", move_when_released)
     answer = suite.call(dry_run=True)
     assert answer.accepted, answer.message
 
 
 def test_a_dry_run_goes_on_while_somebody_else_holds_the_mirror(suite: Suite) -> None:
     suite.shape()
-    suite.bench.hold.ask(HoldMirror.Request.HOLD, "operator", "a test", 0.0, 60.0)
+    suite.bench.hold.handle(HoldMirror.Request.HOLD, "operator", "a test", 0.0, 60.0)
     assert suite.call().error_code == ErrorCode.BUSY
     answer = suite.call(dry_run=True)
     assert answer.accepted and suite.bench.hold.holder == "operator", answer.message

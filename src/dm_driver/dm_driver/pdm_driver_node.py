@@ -71,10 +71,10 @@ class PdmDriverNode(ManagedNode):
 
     def configure(self) -> None:
         configuration = build_configuration(self._values)
-        asked, limits = self._values["limits.slew_rate"], configuration.limiter.limits
-        if limits.slew_rate < asked:
+        wanted, limits = self._values["limits.slew_rate"], configuration.limiter.limits
+        if limits.slew_rate < wanted:
             self.get_logger().info(
-                f"limits.slew_rate = {asked:g} 1/s: {limits.slew_rate:.4g} 1/s is used, for the line carries"
+                f"limits.slew_rate = {wanted:g} 1/s: {limits.slew_rate:.4g} 1/s is used, for the line carries"
                 f" {limits.frames_per_second:.4g} frames per second, each a step of at most {limits.step:g}"
             )
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
@@ -199,7 +199,7 @@ class PdmDriverNode(ManagedNode):
     def _on_hold_mirror(self, request: Any, response: Any) -> Any:
         before = self._hold.holder
         try:
-            self._hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+            self._hold.handle(request.operation, request.holder, request.purpose, request.duration, request.lease)
             response.message = self._hold.sentence or "nobody holds the mirror"
         finally:
             response.holder = self._hold.holder

@@ -89,8 +89,8 @@ def test_a_cancel_that_comes_too_late_reports_how_the_degauss_ended(
 
 
 def test_who_lost_the_mirror_does_not_move_it_by_a_cancel(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> None:
-    hold.ask(Operation.HOLD, "calibration")
-    hold.ask(Operation.TAKE_OVER, "operator")
+    hold.handle(Operation.HOLD, "calibration")
+    hold.handle(Operation.TAKE_OVER, "operator")
     writer = Writer(Outcome.REACHED)
     outcome, code, text = carried_out(hold, writer, monkeypatch)
     assert (outcome, code) == ("canceled", ErrorCode.CANCELED) and "operator" in text

@@ -36,7 +36,7 @@ def clock() -> Clock:
 @pytest.fixture
 def hold(clock: Clock) -> MirrorHold:
     hold = MirrorHold(clock)
-    hold.ask(Operation.HOLD, "calibration", "cancel its action calibrate to end it", duration=95.0)
+    hold.handle(Operation.HOLD, "calibration", "cancel its action calibrate to end it", duration=95.0)
     return hold
 
 
@@ -49,7 +49,7 @@ def refused(code: ErrorCode) -> Iterator[None]:
 
 def test_a_run_that_is_late_is_not_about_to_end(clock: Clock) -> None:
     hold = MirrorHold(clock)
-    hold.ask(Operation.HOLD, "calibration", duration=1.0)
+    hold.handle(Operation.HOLD, "calibration", duration=1.0)
     clock.now += 2.0
     with pytest.raises(Refusal, match=r"for 2 s; take_over"):
         hold.check("", take_over=False)
@@ -62,27 +62,27 @@ def test_others_hear_who_holds_it_how_long_and_how_to_end_it(hold: MirrorHold, c
     assert caught.value.error_code == ErrorCode.BUSY
     assert not hold.check("calibration", take_over=False)
     with refused(ErrorCode.BUSY):
-        hold.ask(Operation.HOLD, "autofocus")
+        hold.handle(Operation.HOLD, "autofocus")
 
 
 def test_a_renewal_keeps_what_it_does_not_say_anew(hold: MirrorHold, clock: Clock) -> None:
     clock.now += 1.0
-    hold.ask(Operation.RENEW, "calibration")
+    hold.handle(Operation.RENEW, "calibration")
     assert "about 94 s to go: cancel its action" in hold.sentence
-    hold.ask(Operation.RENEW, "calibration", "the last maps", duration=11.0, lease=60.0)
+    hold.handle(Operation.RENEW, "calibration", "the last maps", duration=11.0, lease=60.0)
     assert "about 10 s to go: the last maps" in hold.sentence
-    hold.ask(Operation.RENEW, "calibration")
+    hold.handle(Operation.RENEW, "calibration")
     clock.now += 59.0
     assert hold.sentence.endswith("60 s: the last maps; take_over takes it from there")
     clock.now += 2.0
     assert not hold.holder
-    hold.ask(Operation.RENEW, "calibration")  # late, and nobody came between
+    hold.handle(Operation.RENEW, "calibration")  # late, and nobody came between
     assert hold.sentence.startswith("calibration has held the mirror for 62 s: the last maps")
 
 
 def test_it_ends_soon_after_its_holder_died(hold: MirrorHold, clock: Clock) -> None:
     clock.now += 0.9 * LEASE_S
-    hold.ask(Operation.RENEW, "calibration")
+    hold.handle(Operation.RENEW, "calibration")
     clock.now += 0.9 * LEASE_S
     assert hold.holder == "calibration"
     clock.now += 0.2 * LEASE_S
@@ -93,29 +93,29 @@ def test_who_lost_it_does_not_get_it_back_by_renewing(hold: MirrorHold) -> None:
     assert hold.check("", take_over=True)
     hold.evict("")
     with refused(ErrorCode.PREEMPTED):
-        hold.ask(Operation.RENEW, "calibration")
+        hold.handle(Operation.RENEW, "calibration")
     with refused(ErrorCode.PREEMPTED):
         hold.check("calibration", take_over=False)
-    hold.ask(Operation.HOLD, "calibration")
-    hold.ask(Operation.TAKE_OVER, "operator")
+    hold.handle(Operation.HOLD, "calibration")
+    hold.handle(Operation.TAKE_OVER, "operator")
     with refused(ErrorCode.PREEMPTED):
-        hold.ask(Operation.RENEW, "calibration")
-    hold.ask(Operation.RELEASE, "operator")
+        hold.handle(Operation.RENEW, "calibration")
+    hold.handle(Operation.RELEASE, "operator")
     assert hold.holder == ""
-    hold.ask(Operation.HOLD, "autofocus")
+    hold.handle(Operation.HOLD, "autofocus")
     hold.evict("")  # what somebody else loses gives nothing back
     with refused(ErrorCode.PREEMPTED):
-        hold.ask(Operation.RENEW, "calibration")
+        hold.handle(Operation.RENEW, "calibration")
 
 
 @pytest.mark.parametrize("way", ["release", "command"])
 def test_who_lost_it_is_heard_again_after_giving_it_back_or_taking_it(hold: MirrorHold, way: str) -> None:
-    hold.ask(Operation.TAKE_OVER, "operator")
+    hold.handle(Operation.TAKE_OVER, "operator")
     with refused(ErrorCode.PREEMPTED):
         hold.check("calibration", take_over=False)
     if way == "release":
-        hold.ask(Operation.RELEASE, "operator")
-        hold.ask(Operation.RELEASE, "calibration")
+        hold.handle(Operation.RELEASE, "operator")
+        hold.handle(Operation.RELEASE, "calibration")
     else:
         assert hold.check("calibration", take_over=True)
         hold.evict("calibration", take_over=True)
@@ -124,7 +124,7 @@ def test_who_lost_it_is_heard_again_after_giving_it_back_or_taking_it(hold: Mirr
 
 def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) -> None:
     hold = MirrorHold(clock)
-    hold.ask(Operation.RENEW, "calibration")
+    hold.handle(Operation.RENEW, "calibration")
     assert hold.holder == "calibration"
 
 
@@ -144,7 +144,7 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
 )
 def test_fields_that_cannot_be(clock: Clock, code: ErrorCode, fields: dict[str, object]) -> None:
     with refused(code):
-        MirrorHold(clock).ask(**{"operation": Operation.HOLD, "holder": "operator"} | fields)
+        MirrorHold(clock).handle(**{"operation": Operation.HOLD, "holder": "operator"} | fields)
 
 
 @pytest.mark.parametrize("between", ["nobody", "command", "own command, then another", "hold"])
@@ -158,17 +158,17 @@ def test_a_hold_that_lapsed_is_renewed_only_where_nobody_moved_the_mirror(
         assert not hold.check("", take_over=False)
         hold.evict("")
     elif between == "hold":
-        hold.ask(Operation.HOLD, "autofocus")
-        hold.ask(Operation.RELEASE, "autofocus")
+        hold.handle(Operation.HOLD, "autofocus")
+        hold.handle(Operation.RELEASE, "autofocus")
     if between == "nobody":
-        hold.ask(Operation.RENEW, "calibration")
+        hold.handle(Operation.RENEW, "calibration")
         hold.evict("calibration")
         assert hold.holder == "calibration"
     else:
         with refused(ErrorCode.PREEMPTED):
-            hold.ask(Operation.RENEW, "calibration")
-        hold.ask(Operation.HOLD, "calibration")
-        hold.ask(Operation.RENEW, "calibration")
+            hold.handle(Operation.RENEW, "calibration")
+        hold.handle(Operation.HOLD, "calibration")
+        hold.handle(Operation.RENEW, "calibration")
 
 
 class Node:
@@ -188,7 +188,7 @@ def run(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> clients.MirrorHold
     def call(_client: Any, request: Any, *_waits: Any) -> HoldMirror.Response:
         response = HoldMirror.Response()
         try:
-            hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+            hold.handle(request.operation, request.holder, request.purpose, request.duration, request.lease)
         except Refusal as refusal:
             response.error_code, response.message = refusal.error_code, str(refusal)
         response.holder = hold.holder
@@ -224,7 +224,7 @@ def test_a_run_goes_on_in_the_name_of_who_asks_where_they_hold_it(
     with run.held(asked("calibration", take_over), "a loop", 0.0, 1.0):
         assert run.holder == hold.holder == "calibration"
     assert hold.holder == "calibration" and "cancel its action" in hold.sentence
-    hold.ask(Operation.RELEASE, "calibration")
+    hold.handle(Operation.RELEASE, "calibration")
     with run.held(asked("calibration"), "a loop", 0.0, 1.0):
         assert run.holder == hold.holder == "loop"
     assert hold.holder == ""
@@ -239,7 +239,7 @@ def test_a_run_takes_over_what_somebody_else_holds_only_where_it_is_asked_to(
     with run.held(asked(take_over=True), "a loop", 0.0, 1.0):
         assert run.holder == hold.holder == "loop"
         with refused(ErrorCode.PREEMPTED):
-            hold.ask(Operation.RENEW, "calibration")
+            hold.handle(Operation.RENEW, "calibration")
 
 
 def test_nobody_is_granted_the_mirror_while_a_command_of_another_is_on_its_way() -> None:
@@ -247,7 +247,7 @@ def test_nobody_is_granted_the_mirror_while_a_command_of_another_is_on_its_way()
     hold = MirrorHold(time.monotonic)
     gate = CommandGate(hold, lambda _text, _took_over: None)
     gate.writer = gate.configuration = cast(Any, object())
-    asking = threading.Thread(target=hold.ask, args=(Operation.HOLD, "calibration"))
+    asking = threading.Thread(target=hold.handle, args=(Operation.HOLD, "calibration"))
 
     def carry_out(_writer: Any, _configuration: Any) -> str:
         asking.start()
@@ -256,5 +256,5 @@ def test_nobody_is_granted_the_mirror_while_a_command_of_another_is_on_its_way()
 
     assert gate.attempt("set_signals", SimpleNamespace(holder="", take_over=False), carry_out) == "moves"
     asking.join()
-    hold.ask(Operation.RENEW, "calibration")
+    hold.handle(Operation.RENEW, "calibration")
     assert hold.holder == "calibration"

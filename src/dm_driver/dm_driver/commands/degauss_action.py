@@ -40,10 +40,10 @@ class DegaussAction:
     def _admit(self, goal: Any) -> None:
         """Raise the Refusal, logged by the gate, of a goal that is not allowed: it must not end the running one."""
 
-        def judge(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
+        def check(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
             self._move(goal, configuration)
 
-        if isinstance(refusal := self._gate.attempt("degauss", goal, judge), Refusal):
+        if isinstance(refusal := self._gate.attempt("degauss", goal, check), Refusal):
             raise refusal
 
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:

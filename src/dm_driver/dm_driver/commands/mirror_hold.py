@@ -57,7 +57,7 @@ class MirrorHold:
             purpose = f": {self._purpose}" if self._purpose else ""
             return f"{self._holder} has held the mirror for {held:.0f} s{left}{purpose}; take_over takes it from there"
 
-    def ask(self, operation: str, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
+    def handle(self, operation: str, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
         """Hold the mirror, or give it back, as in dm_msgs/HoldMirror.
 
         Raises:

@@ -50,7 +50,7 @@ class Probe:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._socket.setblocking(False)
 
-    def ask(self) -> None:
+    def query(self) -> None:
         self._socket.sendto(QUESTION, self._destination)
 
     def answers(self, timeout_s: float) -> Iterator[Unit]:
@@ -80,7 +80,7 @@ def discover(address: str = BROADCAST, port: int = PORT, timeout_s: float = 1.0)
         OSError: the name is unknown or the network unreachable.
     """
     with closing(Probe(address, port)) as probe:
-        probe.ask()
+        probe.query()
         units: dict[str, Unit] = {}
         for unit in probe.answers(timeout_s):
             units.setdefault(unit.mac, unit)

@@ -177,7 +177,7 @@ class Edac40Udp(_Edac40):
         self._unanswered_since = None
         if self._settings.discovery_port:
             self._probe = Probe(self._settings.address, self._settings.discovery_port)
-            self._probe.ask()
+            self._probe.query()
             if not self._probe.answered(self._timeout_s):
                 raise LinkError(
                     f"no answer to discovery on UDP port {self._settings.discovery_port} within {self._timeout_s:g} s"
@@ -205,7 +205,7 @@ class Edac40Udp(_Edac40):
             self._unanswered_since = now
         elif now - self._unanswered_since > self._timeout_s:
             raise LinkError(f"no answer to discovery for {now - self._unanswered_since:.2f} s")
-        self._probe.ask()
+        self._probe.query()
 
     def _do_close(self) -> None:
         super()._do_close()

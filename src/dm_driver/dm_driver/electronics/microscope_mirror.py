@@ -41,14 +41,14 @@ class MicroscopeMirror(DriveElectronics):
             raise LinkError(
                 "python-microscope needs the package Pyro4: ./dm exec python -m pip install Pyro4"
             ) from error
-        self._link = self._asked(lambda: Pyro4.Proxy(self._settings.address))
+        self._link = self._call(lambda: Pyro4.Proxy(self._settings.address))
         self._link._pyroSerializer, self._link._pyroTimeout = "pickle", self._timeout_s
-        actuators = self._asked(lambda: self._link.n_actuators)
+        actuators = self._call(lambda: self._link.n_actuators)
         if actuators != self.channels:
             raise LinkError(f"has {actuators} actuators, mirror.actuators is {self.channels}")
 
     def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
-        self._asked(lambda: self._link.apply_pattern(codes / self.max_code))
+        self._call(lambda: self._link.apply_pattern(codes / self.max_code))
 
     def _do_check(self) -> None:
         # The server sends nothing unasked: a readable link has ended.
@@ -60,7 +60,7 @@ class MicroscopeMirror(DriveElectronics):
         if link is not None:
             link._pyroRelease()
 
-    def _asked(self, call: Callable[[], Any]) -> Any:
+    def _call(self, call: Callable[[], Any]) -> Any:
         """The result of `call`; any failure there, also in the manufacturer's library, breaks the link, since the
         outputs are then unknown.
         """
