@@ -13,7 +13,7 @@ from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, se
 from dm_autofocus.focus_probe import SharpnessSample
 from dm_autofocus.images import exposure_fault, grey, raw_image
 from dm_autofocus.optics import depth_of_focus, distance_of
-from dm_autofocus.probe_action import ASKED, START_GRACE_S, ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import GOAL_FIELDS, START_GRACE_S, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
@@ -36,7 +36,7 @@ class AutofocusAction(ProbeAction):
     """Serves `autofocus`."""
 
     action_type, name = Autofocus, "autofocus"
-    fields = Fields(ASKED | {"region": reals([], 0.0, 1.0, sizes=(0, 4))})
+    fields = Fields(GOAL_FIELDS | {"region": reals([], 0.0, 1.0, sizes=(0, 4))})
 
     def _plan(self, goal: Any) -> tuple[SearchConfig, Region]:
         capabilities = ready_capabilities(self._probe)

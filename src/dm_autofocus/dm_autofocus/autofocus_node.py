@@ -80,11 +80,11 @@ class AutofocusNode(ManagedNode):
         wanted = SetFocus.Request(dry_run=request.dry_run)
         wanted.request = FocusRequest(curvature=response.curvature, holder=request.holder, take_over=request.take_over)
         self._probe.controller.wait_for_return()
-        gone = self._probe.controller.since_now()
+        lost_reason = self._probe.controller.since_now()
         try:
-            answer = call(self._set_focus, wanted, self._values["move_timeout"], gone)
+            answer = call(self._set_focus, wanted, self._values["move_timeout"], lost_reason)
         except ServiceCallError as error:
-            raise Refusal(ErrorCode.TIMEOUT, gone() or f"focus_controller: {error}") from error
+            raise Refusal(ErrorCode.TIMEOUT, lost_reason() or f"focus_controller: {error}") from error
         response.state = answer.state
         response.error_code, response.message = answer.error_code, answer.message
         able = self._probe.capabilities

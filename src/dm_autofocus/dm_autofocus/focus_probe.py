@@ -70,7 +70,7 @@ class FocusProbe:
         self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
         self.shape: tuple[float, float, Sequence[float]] = (math.nan, 0.0, ())
-        self._asked_for = FocusRequest()  # the latest on focus_request
+        self._latest_request = FocusRequest()  # the latest on focus_request
         self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
@@ -79,7 +79,7 @@ class FocusProbe:
         self.user = ""
         self._check: Callable[[], None] = lambda: None  # raises Refusal if the user is to stop
         self.target = math.nan
-        self._asked: deque[float] = deque(maxlen=8)  # own requests: an answer to one, however late, is no other node's
+        self._requested: deque[float] = deque(maxlen=8)  # own requests: a late answer to one is no other node's
         self._other_request: float | None = None  # curvature requested by another node while held [1/m]
         self._degauss_s = 0.0  # duration of a degauss that the latest move waits for
         self._measuring, self._apart = False, 0.0  # _apart: time between the stamps of the latest two images [s]
@@ -90,7 +90,7 @@ class FocusProbe:
         self._node, self.topic = node, ""
         self._images: Any = None
         node.create_subscription(CameraInfo, "camera_info", partial(setattr, self, "camera_info"), IMAGES)
-        node.create_subscription(FocusRequest, "focus_request", partial(setattr, self, "_asked_for"), qos.COMMAND)
+        node.create_subscription(FocusRequest, "focus_request", partial(setattr, self, "_latest_request"), qos.COMMAND)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         node.create_subscription(Capabilities, "capabilities", partial(setattr, self, "capabilities"), qos.LATCHED)
@@ -124,10 +124,10 @@ class FocusProbe:
     def _on_focus_state(self, message: FocusState) -> None:
         with self._changed:
             if message.applied:
-                shape, asked = (message.curvature, message.conic_constant), self._asked_for
-                answered = (asked.curvature, asked.conic_constant) == shape
-                self.shape = (*shape, asked.zernike if answered else ())
-                self._asked_for = FocusRequest() if answered else asked
+                shape, request = (message.curvature, message.conic_constant), self._latest_request
+                answered = (request.curvature, request.conic_constant) == shape
+                self.shape = (*shape, request.zernike if answered else ())
+                self._latest_request = FocusRequest() if answered else request
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
@@ -135,7 +135,7 @@ class FocusProbe:
                 self._degauss_s = 0.0 if answered else message.predicted_duration
                 if answered:
                     self.answer = self.answer or message
-            elif message.applied and message.curvature not in self._asked:
+            elif message.applied and message.curvature not in self._requested:
                 self._other_request = message.curvature
             self._changed.notify_all()
 
@@ -159,11 +159,11 @@ class FocusProbe:
         return Refusal(ErrorCode.BUSY, f"the action {self.user} is running; cancel it first, or take the mirror over")
 
     @contextmanager
-    def held(self, asked: Any, action: str, check: Callable[[], None]) -> Iterator[None]:
+    def held(self, request: Any, action: str, check: Callable[[], None]) -> Iterator[None]:
         """Hold the mirror for one action of this node during the block, here and at the driver.
 
         Args:
-            asked: the goal of the action, see `MirrorHolder.held`.
+            request: the goal of the action, see `MirrorHolder.held`.
             action: its name.
             check: raises Refusal if the action is to stop; called while `move` and `measure` wait.
 
@@ -178,11 +178,11 @@ class FocusProbe:
                 self.user = action
                 return True
 
-        self._hold.wait_for(free, asked, str(self.busy()), self._values["move_timeout"])
+        self._hold.wait_for(free, request, str(self.busy()), self._values["move_timeout"])
         self._other_request, self.counted, self.dropped = None, 0, 0
         self._check = check
         try:
-            with self._hold.held(asked, f"action {action}; cancel it to end it", 0.0, self._values["move_timeout"]):
+            with self._hold.held(request, f"action {action}; cancel it to end it", 0.0, self._values["move_timeout"]):
                 yield
         except ServiceCallError as error:  # from holding the mirror: actions call no service
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
@@ -204,16 +204,16 @@ class FocusProbe:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"], ahead)
             self.answer, self._degauss_s = None, 0.0
             self.target = curvature
-            self._asked.append(curvature)
-        mode, holder, gone = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
+            self._requested.append(curvature)
+        mode, holder, lost_reason = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
         shape = {"curvature": curvature, "conic_constant": conic_constant, "zernike": zernike}
         self._request.publish(FocusRequest(**shape, mode=mode, holder=holder))
         limit = self._values["move_timeout"]
-        self._wait(lambda: self.answer is not None or bool(gone()), limit, self._check)
+        self._wait(lambda: self.answer is not None or bool(lost_reason()), limit, self._check)
         answer = self.answer
         if answer is None:
             text = f"no answer to a focus request within {limit:g} s: is focus_controller running?"
-            raise Refusal(ErrorCode.TIMEOUT, gone() or text)
+            raise Refusal(ErrorCode.TIMEOUT, lost_reason() or text)
         if not answer.applied:
             raise Refusal(answer.error_code, answer.message)
         with self._changed:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from dm_autofocus.autofocus_parameters import tolerance_of
 from dm_autofocus.focus_stack import FEWEST, ImageStack
 from dm_autofocus.images import PLANAR, exposure_fault, grey, image_message, pixels_of
-from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import GOAL_FIELDS, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
 from dm_common import Floats
@@ -32,7 +32,7 @@ class FocusStackAction(ProbeAction):
     """Serves `focus_stack`, and publishes its results."""
 
     action_type, name = FocusStack, "focus_stack"
-    fields = Fields(ASKED | {"images": whole(0, 0, MOST)})
+    fields = Fields(GOAL_FIELDS | {"images": whole(0, 0, MOST)})
 
     def __init__(self, node: Node, *shared: Any) -> None:
         super().__init__(node, *shared)

@@ -187,13 +187,13 @@ class SettledGate:
         self._stamp_lead = stamp_lead
         self._ahead = ahead
         self._sent_at = math.inf
-        self._stands_at = math.inf
+        self._arrives_at = math.inf
         self.settled_at = math.inf
 
     def sent(self, stamp: float, duration: float = 0.0) -> None:
         """Note that a command was sent at `stamp`; its move is predicted to end `duration` later."""
         self._sent_at = stamp
-        self._stands_at = stamp + duration
+        self._arrives_at = stamp + duration
         self.settled_at = math.inf
 
     def written(self, stamp: float, moving: bool, reached: bool) -> None:
@@ -203,7 +203,7 @@ class SettledGate:
         the driver received the command: then the move ends at the predicted time at the earliest.
         """
         if math.isinf(self.settled_at) and not moving and (stamp >= self._sent_at or reached):
-            earliest = self._sent_at if reached else self._stands_at
+            earliest = self._sent_at if reached else self._arrives_at
             self.settled_at = max(stamp, earliest) + self._settle_time
 
     def open_for(self, stamp: float, now: float = math.inf) -> bool:

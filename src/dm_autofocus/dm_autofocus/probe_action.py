@@ -20,7 +20,7 @@ from dm_common.values import Fields, fill_with_nan, real, text
 MARGIN = 0.002
 
 #: Allowed values of the fields that every goal has.
-ASKED = {"curvature_min": real(0.0), "curvature_max": real(0.0), "holder": text("")}
+GOAL_FIELDS = {"curvature_min": real(0.0), "curvature_max": real(0.0), "holder": text("")}
 
 #: How long a goal waits for a controller that may still be starting, s.
 START_GRACE_S = 5.0

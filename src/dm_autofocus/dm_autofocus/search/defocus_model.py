@@ -104,9 +104,9 @@ class DefocusModel:
         # The window correlates neighbouring values: by a factor of 1.5 along each side.
         self.modes = self._count * len(self._starts) / 2.25
         self._step = STEP * depth_of_focus(lens.aperture_radius, lens.wavelength)
-        self._look_through(lens, math.ceil(reach / self._step) + 2)
+        self._set_lens(lens, math.ceil(reach / self._step) + 2)
 
-    def _look_through(self, lens: FocusLens, length: int) -> None:
+    def _set_lens(self, lens: FocusLens, length: int) -> None:
         self._lens = lens
         self._transfer = _transfer_table(self._edges, lens, length)
         self._envelope = _envelope(self._transfer)
@@ -129,7 +129,7 @@ class DefocusModel:
         other, misfits = copy(self), {}
         for scale in SCALES:
             lens = replace(self._lens, focal_length_px=scale * self._lens.focal_length_px)
-            other._look_through(lens, int(FITTED) + 8)
+            other._set_lens(lens, int(FITTED) + 8)
             misfits[scale] = other.judge(grid, places[near], powers[near], TRANSFER_ERROR)[0].min()
         best = min(misfits, key=misfits.__getitem__)
         named = (best <= 0.35 or best >= 2) and misfits[best] < misfits[1.0] - BETTER
