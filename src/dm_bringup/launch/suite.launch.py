@@ -70,18 +70,18 @@ def brought_up(action):
 
     Where somebody else configures it later, activating it is left to them.
     """
-    asked = set()
+    requested = set()
 
     def change(transition):
         return [EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(action), transition_id=transition))]
 
     def begin(_context):
-        asked.add(action)
+        requested.add(action)
         return change(Transition.TRANSITION_CONFIGURE)
 
     def go_on(context):
-        ours = bool(asked) and context.locals.event.goal_state == "inactive"
-        asked.clear()
+        ours = bool(requested) and context.locals.event.goal_state == "inactive"
+        requested.clear()
         return change(Transition.TRANSITION_ACTIVATE) if ours else []
 
     # A request that leaves before both sides have discovered each other is lost, and so is one to a process that died.

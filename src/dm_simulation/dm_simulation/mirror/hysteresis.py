@@ -225,15 +225,15 @@ def _weight_and_scale(name: str, law: HysteresisLaw, fraction: Array) -> tuple[A
     """Weight (N,) of the law and scale (N,) of the sum for the required openings (N,)."""
     rising, falling = _full_loop(law, len(fraction))
     opening, span = np.max(falling - rising, axis=0), rising[-1] - rising[0]
-    asked = f"piezo.hysteresis = {fraction.max():g}"
+    setting = f"piezo.hysteresis = {fraction.max():g}"
     # fraction = weight * opening / (2 + weight * span)
     if name.startswith("drawn"):
         fraction = np.where(span > 0, np.minimum(fraction, WIDEST * opening / np.maximum(span, 1e-9)), fraction)
     free = opening - fraction * span
     if np.any(free <= 0):
-        raise ValueError(f"{asked}: {name} reaches at most {np.min(opening / span):.2f}")
+        raise ValueError(f"{setting}: {name} reaches at most {np.min(opening / span):.2f}")
     weight = 2 * fraction / free
     steepest = np.min(np.diff(rising, axis=0), axis=0) / (2 / (SWEEP_POINTS - 1))
     if np.any(1 + weight * steepest <= 0):
-        raise ValueError(f"{asked}: too wide, {name} would no longer rise with the signal")
+        raise ValueError(f"{setting}: too wide, {name} would no longer rise with the signal")
     return weight, 2 / (2 + weight * span)
