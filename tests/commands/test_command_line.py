@@ -343,7 +343,7 @@ def test_a_map_is_held_against_what_is_promised_beyond_the_prediction(
     )
     monkeypatch.setattr(check, "running_suite", lambda _namespace: nullcontext(client))
     monkeypatch.setattr(check, "nodes_of_suite", lambda _client: {"focus_controller": 1})
-    monkeypatch.setattr(check, "hear_health", lambda _client: {"focus_controller": SimpleNamespace(values=pairs)})
+    monkeypatch.setattr(check, "receive_health", lambda _client: {"focus_controller": SimpleNamespace(values=pairs)})
     said = CliRunner().invoke(cli.app, ["check", "--json", str(tmp_path / "figures")])
     assert said.exit_code == code, said.output
     assert f"largest coefficient beyond what is predicted: promised {promised:g} nm (95 % bound" in said.output

@@ -55,7 +55,7 @@ from dm_tools.recording.player import play, replayed
 from dm_tools.recording.recorder import Recorder
 from dm_tools.recording.session import COMPARED, _parameters, differences, read_session, recalibrate
 from dm_tools.verbs.record import record
-from dm_tools.verbs.replay import _again
+from dm_tools.verbs.replay import _recalibrated
 from recorded_bench import recorded
 from support import Observer, wait_until
 
@@ -80,7 +80,7 @@ def write_bag(folder: Path, messages: list[tuple[str, Any]]) -> BagReader:
 
 def told_by(recorder: Recorder) -> int:
     """How many nodes have told their parameters, one that was started anew counted again."""
-    return sum(again == math.inf for again in recorder._asked.values())
+    return sum(again == math.inf for again in recorder._retry_at.values())
 
 
 def write_rosbag2(folder: Path, messages: list[Message], storage: str) -> None:
@@ -264,7 +264,7 @@ def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
     write_rosbag2(tmp_path / "theirs", held, "mcap")
     config, section = tmp_path / "bench.yaml", "/calibration: {ros__parameters: {poke_amplitude: 0."
     config.write_text(f"/left{section}4}}}}\n/right{section}3}}}}\n")
-    figures = _again(BagReader(tmp_path / "theirs"), 0, "/left", None, config)
+    figures = _recalibrated(BagReader(tmp_path / "theirs"), 0, "/left", None, config)
     assert figures["identical"] is True
 
 

@@ -16,7 +16,7 @@ from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.demo.demo_bench import bench_config
-from dm_tools.running_suite import hear_health
+from dm_tools.running_suite import receive_health
 from dm_tools.security.interfaces import interfaces
 from dm_tools.security.keystore import check_keystore, keys_missing
 from dm_tools.security.policy import Profile, dds_topics, write_profile
@@ -51,7 +51,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
             client.wait_until_active(60.0)
             wait_until(lambda: client.node.count_publishers("surface_map"), 60.0)
             client.measure_map()  # its subscriptions are made when they are needed
-            hear_health(client)  # as `dm status` and `dm check` do
+            receive_health(client)  # as `dm status` and `dm check` do
             client.subscribe("recipes", RecipeBook, qos.LATCHED)  # as `dm recipes` does
             yield client
         finally:

@@ -34,7 +34,7 @@ def get_parameter(client: Any, node: str, name: str) -> Any:
     return parameter_value_to_python(answer.values[0])
 
 
-def _answer(client: Any, node: str, ask: Any) -> Any:
+def _answer(client: Any, node: str, query: Any) -> Any:
     from rclpy.parameter_client import AsyncParameterClient
 
     from dm_client import DeformableMirrorError
@@ -42,7 +42,7 @@ def _answer(client: Any, node: str, ask: Any) -> Any:
 
     parameters = AsyncParameterClient(client.node, node)
     if client.wait(parameters.services_are_ready):
-        answer = ask(parameters)
+        answer = query(parameters)
         if client.wait(answer.done):
             return answer.result()
     code = UNAVAILABLE.get(node, ErrorCode.TIMEOUT)

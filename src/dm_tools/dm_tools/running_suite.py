@@ -60,7 +60,7 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
         yield client
 
 
-def heard(client: DeformableMirrorClient, topic: str, timeout_s: float) -> Any:
+def latest_message(client: DeformableMirrorClient, topic: str, timeout_s: float) -> Any:
     """The latest message of a topic that the client follows; None = none came in time."""
     client.wait(lambda: topic in client.messages, timeout_s)
     return client.messages.get(topic)
@@ -120,7 +120,7 @@ def holder(client: DeformableMirrorClient) -> str:
     from dm_client.client import INTERFACES
     from dm_tools.long_actions import LONG, ExternalGoals
 
-    state = heard(client, "actuator_state", BUSY_S)
+    state = latest_message(client, "actuator_state", BUSY_S)
     if state is None or not state.holder:
         return ""
     holding = state.holding.partition(": ")[0]  # without the driver's hint how to end it: the commands give their own
@@ -155,7 +155,7 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
         raise
 
 
-def hear_health(client: DeformableMirrorClient, times: list[int] | None = None) -> dict[str, Any]:
+def receive_health(client: DeformableMirrorClient, times: list[int] | None = None) -> dict[str, Any]:
     """{node: its latest status on /diagnostics}, filled from now on, as is `times` with times of the bench, s."""
     from diagnostic_msgs.msg import DiagnosticArray
 

@@ -478,11 +478,11 @@ def test_the_loop_comes_back_with_its_law_and_its_doubt_follows() -> None:
 
 
 @pytest.mark.usefixtures("page")
-def test_a_prediction_goes_with_its_wish() -> None:
+def test_a_prediction_goes_with_its_inputs() -> None:
     session, _ = session_of(StateObserver())
     focus = FocusCard(session)
-    focus._asking = True  # nothing is asked of nodes
-    focus._wish = focus._predicted = (0.0, 0.0, focus._mode.value)
+    focus._predicting = True  # nothing is asked of nodes
+    focus._inputs = focus._predicted = (0.0, 0.0, focus._mode.value)
     focus._prediction.show("Predicted residual 5.0 nm rms")
     focus.refresh(bench())
     assert focus._prediction.text

@@ -196,11 +196,11 @@ class ConsoleNode:
         if own is not None:
             own.set()
         # While a goal of this console is starting, the goal of another client is not cancelled.
-        asked = None if watched is None or (own is not None and watched.running) else watched.cancel()
-        if asked is None:
+        cancellation = None if watched is None or (own is not None and watched.running) else watched.cancel()
+        if cancellation is None:
             return
-        if not await asyncio.to_thread(self._connection.wait, asked.done, ANSWER_S):
+        if not await asyncio.to_thread(self._connection.wait, cancellation.done, ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
-        code, codes = asked.result().return_code, CancelGoal.Response
+        code, codes = cancellation.result().return_code, CancelGoal.Response
         if code not in (codes.ERROR_NONE, codes.ERROR_GOAL_TERMINATED):
             raise Refusal(ErrorCode.NOT_SUPPORTED, f"{name}: its node does not cancel the goal (code {code})")

@@ -22,7 +22,7 @@ class Loop:
 
     Attributes:
         signals, rising, falling: the closed cycle over the whole range by the law: signals, effective signals.
-        stands: (signal, effective signal) now; None = not known.
+        position: (signal, effective signal) now; None = not known.
         path, modelled_path, measured: signals of a measured loop, effective signals by law and by maps; may be empty.
     """
 
@@ -30,7 +30,7 @@ class Loop:
     signals: tuple[float, ...]
     rising: tuple[float, ...]
     falling: tuple[float, ...]
-    stands: tuple[float, float] | None = None
+    position: tuple[float, float] | None = None
     path: tuple[float, ...] = ()
     modelled_path: tuple[float, ...] = ()
     measured: tuple[float, ...] = ()

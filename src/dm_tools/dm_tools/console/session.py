@@ -136,13 +136,13 @@ class Session:
         self,
         title: str,
         operation: Callable[..., Awaitable[str]],
-        wish: Callable[[], Any] | None = None,
+        get_argument: Callable[[], Any] | None = None,
         cancel: str | None = None,
     ) -> None:
         """Start an operation; when another is under way, say so instead.
 
         Args:
-            operation: called with this session and the result of `wish`, if given; returns its outcome in words.
+            operation: called with this session and the result of `get_argument` if given; returns its outcome in words.
                 Both raise Refusal or ValueError with the sentence to show.
             cancel: the action that is cancelled to stop it; "" = it reads `cancelled` itself, None = cannot be stopped.
         """
@@ -151,13 +151,13 @@ class Session:
             return
         self.progress = Progress(title, can_cancel=cancel is not None)
         self._cancel, self.cancelled, self.outcome = cancel, False, ""
-        self._task = asyncio.get_running_loop().create_task(self._follow(title, operation, wish))
+        self._task = asyncio.get_running_loop().create_task(self._follow(title, operation, get_argument))
 
     async def _follow(
-        self, title: str, operation: Callable[..., Awaitable[str]], wish: Callable[[], Any] | None
+        self, title: str, operation: Callable[..., Awaitable[str]], get_argument: Callable[[], Any] | None
     ) -> None:
         try:
-            outcome = await operation(self, *([wish()] if wish is not None else []))
+            outcome = await operation(self, *([get_argument()] if get_argument is not None else []))
             self.outcome = f"{title}: {outcome} ({time.strftime('%H:%M:%S')})"
             self._outcome_ends = time.monotonic() + SHOWN_S
         except (Refusal, ValueError) as error:

@@ -109,7 +109,7 @@ def save_animation(
             text = f"{item.distance:g} m: found {item.result.distance:.2f} m, {len(item.shots)} images"
         show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
 
-    def stand(shown: int) -> None:
+    def show_sweep(shown: int) -> None:
         for line in cross:
             line.set_visible(True)
         show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
@@ -134,7 +134,7 @@ def save_animation(
     for number, item in enumerate(found):
         schedule += [(search, (number, shown), 1) for shown in range(len(item.shots))]
         schedule += [(search, (number, len(item.shots)), HOLD)]
-    schedule += [(stand, (shown,), 1) for shown in range(len(sweep.shots))]
+    schedule += [(show_sweep, (shown,), 1) for shown in range(len(sweep.shots))]
     schedule += [(everything, (0,), 2 * HOLD)]
     schedule += [(track, (shown,), 1) for shown in range(len(approach.shots))]
     schedule += [(track, (len(approach.shots) - 1,), HOLD)] if approach.shots else []
@@ -148,8 +148,8 @@ def save_animation(
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     durations = [1000 * frames // frames_per_second for _, _, frames in schedule]
     # One palette for all frames: the colours of those on which the animation rests, and greys for the pictures.
-    rests = [image for image, (_, _, frames) in zip(images, schedule, strict=True) if frames > 1]
-    sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in rests]))
+    held_images = [image for image, (_, _, frames) in zip(images, schedule, strict=True) if frames > 1]
+    sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in held_images]))
     palette = sheet.quantize(PALETTE, Image.Quantize.MAXCOVERAGE)
     greys = np.repeat(np.linspace(0, 255, GREYS).astype(int), 3)
     palette.putpalette([*(palette.getpalette() or ())[: 3 * PALETTE], *greys.tolist()])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dm_bringup.nodes import NODES
-from dm_tools.running_suite import BUSY_S, NEEDED, heard, nodes_of_suite, where
+from dm_tools.running_suite import BUSY_S, NEEDED, latest_message, nodes_of_suite, where
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
 #: Least free space in /dev/shm, B: virtual bench, autofocus and every program take 16 MB each (config/fastdds.xml).
@@ -202,7 +202,7 @@ def link_lost(client: Any) -> str:
     """Why the driver does not reach its unit; "" = it does, or says nothing."""
     from dm_msgs.msg import ActuatorState
 
-    state = heard(client, "actuator_state", REPORTS_S)
+    state = latest_message(client, "actuator_state", REPORTS_S)
     return str(state.message) if state is not None and state.driver_state == ActuatorState.STATE_LINK_LOST else ""
 
 

@@ -29,7 +29,7 @@ from dm_tools.recording.interfaces import UnknownTypeError, definition, message_
 #: How often new topics are looked for, s.
 DISCOVERY_PERIOD_S = 0.25
 #: A node is asked for its parameters again after this time, s: just after a start, request or answer may be lost.
-ASK_AGAIN_S = 5.0
+RETRY_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
 #: Longest sleep of the executor, s; only bounds how soon it ends.
@@ -87,7 +87,7 @@ class Recorder:
         self._subscribed: set[str] = set()
         self._clients: dict[str, AsyncParameterClient] = {}
         # By publisher of a node's parameter events: when to ask it again (monotonic, s); when it was first seen, ns.
-        self._asked: dict[bytes, float] = {}
+        self._retry_at: dict[bytes, float] = {}
         self._seen: dict[bytes, int] = {}
         self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
@@ -146,7 +146,7 @@ class Recorder:
         for name, types in self._node.get_topic_names_and_types():
             if name not in self._subscribed and self._records(name):
                 self._subscribe(name, types[0])
-        self._ask_parameters()
+        self._request_parameters()
 
     def _records(self, name: str) -> bool:
         if self._wanted:
@@ -175,7 +175,7 @@ class Recorder:
         profile = profile_for(topic, DEPTH, all(offer.reliability.name == "RELIABLE" for offer in offers))
         self._node.create_subscription(message_class(type_name), name, take, profile, raw=True)
 
-    def _ask_parameters(self) -> None:
+    def _request_parameters(self) -> None:
         """Ask each node of the suite for its parameters, once after every start of it; the answers come later."""
         if PARAMETER_EVENTS not in self._subscribed:
             return
@@ -183,14 +183,14 @@ class Recorder:
         for publisher in self._node.get_publishers_info_by_topic(PARAMETER_EVENTS):
             name, node = publisher.node_name, bytes(publisher.endpoint_gid)
             path = f"{publisher.node_namespace.rstrip('/')}/{name}"
-            if name not in NAMES or now < self._asked.get(node, now) or not path.startswith(self._namespace):
+            if name not in NAMES or now < self._retry_at.get(node, now) or not path.startswith(self._namespace):
                 continue
             self._seen.setdefault(node, self._now_ns())
             if path not in self._clients:
                 self._clients[path] = AsyncParameterClient(self._node, path)
             if not self._clients[path].services_are_ready():
                 continue
-            self._asked[node] = now + ASK_AGAIN_S
+            self._retry_at[node] = now + RETRY_S
             listed = self._clients[path].list_parameters()
             listed.add_done_callback(lambda future, path=path, node=node: self._on_listed(path, node, future))
 
@@ -212,7 +212,7 @@ class Recorder:
             event = serialize_message(ParameterEvent(node=path, new_parameters=given))
             # Stamped with the time of its discovery: later changes are recorded after it and replace its values.
             self._jobs.put(partial(self._bag.write, PARAMETER_EVENTS, event, self._seen[node]))
-            self._asked[node] = math.inf
+            self._retry_at[node] = math.inf
 
         client.get_parameter_types(names).add_done_callback(fetch)
 

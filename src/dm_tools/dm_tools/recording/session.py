@@ -176,14 +176,14 @@ def _model(calibration: Any) -> Any:
 def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Parameters of `node` when the run began, and what is not known of them."""
     defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
-    told: dict[str, Any] = {}
+    recorded: dict[str, Any] = {}
     # The recorder writes answers later than their stamps; only a finished file is read in order of time.
     for message in sorted(bag.read([PARAMETER_EVENTS]), key=lambda each: each.log_time):
         event, before = _decode(message), message.log_time < begun
         if event.node == node:
             for each in [*event.new_parameters, *(event.changed_parameters if before else ())]:
-                if before or each.name not in told:  # the recorder may have been answered during the run
-                    told[each.name] = parameter_value_to_python(each.value)
-    missing = defaults.keys() - told.keys()
+                if before or each.name not in recorded:  # the recorder may have been answered during the run
+                    recorded[each.name] = parameter_value_to_python(each.value)
+    missing = defaults.keys() - recorded.keys()
     remarks = (f"The recording does not hold all parameters of {node}; defaults are taken.",) if missing else ()
-    return defaults | {name: value for name, value in told.items() if name in defaults}, remarks
+    return defaults | {name: value for name, value in recorded.items() if name in defaults}, remarks

@@ -30,7 +30,7 @@ LOGS = ("/parameter_events", "/rosout")
 CLOCK = "/clock"
 HEALTH = "/diagnostics"
 #: What an operator's program subscribes to and calls.
-_HEARD = (HEALTH, "actuator_state", "calibration", "capabilities", "mirror_info", "recipes")
+_SUBSCRIBED = (HEALTH, "actuator_state", "calibration", "capabilities", "mirror_info", "recipes")
 _MAPS = ("surface_map", "surface_map_info")
 _OPERATION = ("flatten", "hold_mirror", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("build_recipes", "calibrate", "converge", "degauss", "move_focus")
@@ -112,14 +112,14 @@ _DECLARED = (
     ),
     NodeInterface(
         "dm_console_*",
-        subscribe=(*_HEARD, *_MAPS, "/rosout", "actuator_estimate", "zernike"),
+        subscribe=(*_SUBSCRIBED, *_MAPS, "/rosout", "actuator_estimate", "zernike"),
         request=_OPERATION,
         call=_LONG_OPERATION,
         enclave="console",
     ),
     NodeInterface(
         "dm_client_*",
-        subscribe=(*_HEARD, *_MAPS),
+        subscribe=(*_SUBSCRIBED, *_MAPS),
         request=(*_OPERATION, "ingest_file", "update_calibration"),
         call=_LONG_OPERATION,
         enclave="cli",

@@ -90,10 +90,10 @@ def metres(text: str) -> float:
 def made_by(client: Any, result: Any) -> Any:
     """The message of the calibration that a run made; None where it is not in use."""
 
-    def heard() -> bool:
+    def arrived() -> bool:
         return getattr(client.messages.get("calibration"), "id", "") == result.id
 
-    return client.messages["calibration"] if result.id and client.wait(heard, REPORT_S) else None
+    return client.messages["calibration"] if result.id and client.wait(arrived, REPORT_S) else None
 
 
 def show_result(result: Any, calibration: Any = None) -> None:

@@ -10,11 +10,11 @@ from dm_tools.running_suite import (
     BUSY_S,
     MENTIONED,
     REPORT_S,
-    hear_health,
     kept,
     naming_holder,
     nodes_of_suite,
     promise_of,
+    receive_health,
     running_suite,
     settled_shape,
     unknown_history,
@@ -46,7 +46,7 @@ def check(
     if forget and (dry_run or without):
         raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
-        health = hear_health(client)
+        health = receive_health(client)
         # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
         # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
         # another surface than the model predicts, so for a conditioned shape the model's bound counts.

@@ -7,7 +7,7 @@ import typer
 from dm_common.figures import accuracy_text, in_nanometres
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
-from dm_tools.running_suite import MENTIONED, REPORT_S, heard, naming_holder, promise, running_suite
+from dm_tools.running_suite import MENTIONED, REPORT_S, latest_message, naming_holder, promise, running_suite
 
 
 def focus(
@@ -29,7 +29,7 @@ def focus(
     with running_suite(namespace) as client, naming_holder(client):
         try:
             state = client.focus(wanted, conic, dry_run=True)
-            _show(state, heard(client, "calibration", REPORT_S))
+            _show(state, latest_message(client, "calibration", REPORT_S))
             if not dry_run and wait:
                 result = client.move_focus(wanted, conic, take_over=take_over)
                 state = result.state
@@ -54,7 +54,7 @@ def flatten(
     """Make the surface as flat as the mirror can: curvature 0, its own figure corrected."""
     with running_suite(namespace) as client, naming_holder(client):
         state = client.flatten(dry_run=dry_run, take_over=take_over)
-        _show(state, heard(client, "calibration", REPORT_S))
+        _show(state, latest_message(client, "calibration", REPORT_S))
     if state.applied:
         console.print(f"commanded{_held(state)}")
     write_json(json, {"focus": [figures_of(state)]})

@@ -43,9 +43,9 @@ def replay(
     if recalibrate:
         if rate != 1.0 or topics or commands:
             raise typer.BadParameter("--rate, --topics and --commands are for publishing, not for --recalibrate")
-        again = _again(bag, run, namespace, store, config)
-        write_json(json, again)
-        if again["identical"] is False:
+        result = _recalibrated(bag, run, namespace, store, config)
+        write_json(json, result)
+        if result["identical"] is False:
             raise RuntimeError("the calibration made again is not the one that was recorded")
         return
     if run or store or config:
@@ -68,7 +68,7 @@ def replay(
     write_json(json, published)
 
 
-def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
+def _recalibrated(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
     """Make the calibration again; returns its figures."""
     from dm_calibration.store.calibration_store import CalibrationStore
     from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate

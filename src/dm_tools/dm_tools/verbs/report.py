@@ -13,7 +13,7 @@ import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 from dm_tools.parameter_changes import get_parameter
-from dm_tools.running_suite import BUSY_S, FIND_S, heard, nodes_of_suite
+from dm_tools.running_suite import BUSY_S, FIND_S, latest_message, nodes_of_suite
 
 #: Folder of the shipped virtual bench, and the default store of the node `calibration`.
 VIRTUAL, HARDWARE = Path("~/.ros/dm_bench"), Path("~/.ros/dm_calibrations")
@@ -29,7 +29,7 @@ def running_calibration(namespace: str) -> tuple[Path | None, dict[str, Any], st
 
     with DeformableMirrorClient(namespace) as client:
         runs = client.wait(lambda: nodes_of_suite(client), FIND_S)
-        if not runs or (message := heard(client, "calibration", BUSY_S)) is None:
+        if not runs or (message := latest_message(client, "calibration", BUSY_S)) is None:
             return None, CRITERIA, ""
         values = CRITERIA
         with suppress(DeformableMirrorError):  # it may not be allowed to read them (docs/security.md)

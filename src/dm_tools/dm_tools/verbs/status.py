@@ -14,10 +14,10 @@ from dm_tools.running_suite import (
     SettledShape,
     ago,
     calibration_refused,
-    hear_health,
     holder,
     nodes_of_suite,
     promise,
+    receive_health,
     running_suite,
     settled_shape,
     unknown_history,
@@ -32,16 +32,16 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     """Show on one screen what runs, the present shape and its error bound, and what to do next."""
     with running_suite(namespace) as client:
         times: list[int] = []
-        health = hear_health(client, times)
+        health = receive_health(client, times)
         client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
         client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), MISSING_S - REPORT_S)
         client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
         by = holder(client)
         found, place = nodes_of_suite(client), where(client)
-    mirror, heard, capabilities, state = (
+    mirror, latest, capabilities, state = (
         client.messages.get(name) for name in ("mirror_info", "calibration", "capabilities", "actuator_state")
     )
-    calibration = heard if heard is not None and heard.id else None
+    calibration = latest if latest is not None and latest.id else None
     shape, lacking = settled_shape(health), [name for name in NEEDED if not found[name]]
     twice = [name for name, count in found.items() if count > 1]
     rows = {
@@ -50,7 +50,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         + (f"; [red]running more than once: {', '.join(twice)}[/]" if twice else ""),
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
-        "calibration": _calibration(heard, times[-1] if times else time.time()),
+        "calibration": _calibration(latest, times[-1] if times else time.time()),
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),

@@ -183,9 +183,9 @@ def loop_chart(loop: Loop) -> Drawing:
             line("model of the measured way", loop.path, loop.modelled_path, GREY, "dotted"),
             {"type": "scatter", "name": "measured", "data": points(loop.path, loop.measured), "itemStyle": edged},
         ]
-    if loop.stands is not None:
+    if loop.position is not None:
         cross = {"type": "scatter", "name": "now", "symbol": CROSS, "symbolSize": 16, "itemStyle": {"color": INK}}
-        series.append(cross | {"data": [list(loop.stands)], "z": 5})
+        series.append(cross | {"data": [list(loop.position)], "z": 5})
     return chart(
         f"hysteresis loop of actuator {loop.actuator}: {loop.text}",
         color=[VERMILION, BLUE, *([GREY, ORANGE] if loop.measured else []), INK],

@@ -157,16 +157,16 @@ class ActuatorCards:
             )
             return
         settled = session.ros.observer.now(snapshot.bench_time)
-        signal, stands = self._cells[session.chosen - 1].signal, None
+        signal, position = self._cells[session.chosen - 1].signal, None
         if settled.effective is not None and signal is not None:
-            stands = (signal, round(float(settled.effective[session.chosen - 1]), 4))
+            position = (signal, round(float(settled.effective[session.chosen - 1]), 4))
         measured = session.loops.get((calibration.id, session.chosen))
-        key = (session.chosen, calibration.id, stands, settled.doubt, id(measured))
+        key = (session.chosen, calibration.id, position, settled.doubt, id(measured))
         if key == self._loop:
             return
         self._loop = key
         loop = measured or modelled_loop(law, session.chosen, mirror.signal_min, mirror.signal_max)
-        loop = dataclasses.replace(loop, stands=stands)
+        loop = dataclasses.replace(loop, position=position)
         doubt = f" Its place in the loop is a guess: {settled.doubt}." if settled.doubt else ""
         self._loop_text.show(f"Hysteresis as identified: {loop.text}; the cross marks its present state.{doubt}")
         self._loop_picture.show(loop_chart(loop))

@@ -18,7 +18,7 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 #: Step of the slider, 1/m.
 STEP = 0.0005
 #: Transient refusals of a prediction, which say nothing about the shape, and the time until it is tried again, s.
-PASSING, AGAIN_S = (ErrorCode.TIMEOUT, ErrorCode.BUSY, ErrorCode.DRIVER_UNAVAILABLE), 2.0
+TRANSIENT, RETRY_S = (ErrorCode.TIMEOUT, ErrorCode.BUSY, ErrorCode.DRIVER_UNAVAILABLE), 2.0
 
 
 class FocusCard:
@@ -27,8 +27,8 @@ class FocusCard:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._range: tuple[float, float] | None = None
-        self._asked = self._asking = self._typing = False
-        self._wish: tuple[object, ...] = ()  # the fields, and everything else that a prediction depends on
+        self._requested = self._predicting = self._typing = False
+        self._inputs: tuple[object, ...] = ()  # the fields, and everything else that a prediction depends on
         self._predicted: tuple[object, ...] = ()  # the fields of the latest prediction
         with card("Focus"):
             self._text = Line("text figures")
@@ -79,14 +79,14 @@ class FocusCard:
         self._take_range(snapshot)
         value = self._number.number
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
-        wish = (value, self._conic.number, self._mode.value, *self._prediction_basis(snapshot))
-        if wish[:3] != self._predicted:
+        inputs = (value, self._conic.number, self._mode.value, *self._prediction_basis(snapshot))
+        if inputs[:3] != self._predicted:
             self._prediction.show("")
-        if wish != self._wish:
-            self._wish, self._asked = wish, False
-        elif not (reason or self._asked or self._asking):  # unchanged since the last refresh
-            self._asked = self._asking = True
-            self._predicted = wish[:3]
+        if inputs != self._inputs:
+            self._inputs, self._requested = inputs, False
+        elif not (reason or self._requested or self._predicting):  # unchanged since the last refresh
+            self._requested = self._predicting = True
+            self._predicted = inputs[:3]
             background_tasks.create(self._predict())
 
     def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
@@ -94,8 +94,8 @@ class FocusCard:
         able, state, book = snapshot.capabilities, snapshot.actuator_state, snapshot.recipes
         promised = (able.calibration_id, able.error_bound, able.error_bound_conditioned) if able is not None else ()
         recipes = (len(book.recipes), str(book.stamp)) if book is not None else ()
-        stands = () if state is None else (state.history_known, *(round(each, 1) for each in state.requested))
-        return *promised, *recipes, *stands, self._session.running  # corrections of creep are below the rounding
+        signals = () if state is None else (state.history_known, *(round(each, 1) for each in state.requested))
+        return *promised, *recipes, *signals, self._session.running  # corrections of creep are below the rounding
 
     def _take_range(self, snapshot: Snapshot) -> None:
         capabilities = snapshot.capabilities
@@ -127,8 +127,8 @@ class FocusCard:
         except (Refusal, ValueError) as error:
             self._prediction.classes(add="refused")
             self._prediction.show(str(error))
-            if isinstance(error, Refusal) and error.error_code in PASSING:
-                await asyncio.sleep(AGAIN_S)
-                self._wish = ()
+            if isinstance(error, Refusal) and error.error_code in TRANSIENT:
+                await asyncio.sleep(RETRY_S)
+                self._inputs = ()
         finally:
-            self._asking = False
+            self._predicting = False
