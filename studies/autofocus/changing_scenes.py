@@ -18,7 +18,7 @@ from dm_autofocus.search.focus_search import FocusSearch
 from dm_autofocus.search.peak_search import Peak
 from dm_autofocus.search.tracking import MotionTracker, TrackConfig, Tracker
 from dm_autofocus.sharpness import cut, tenengrad
-from studies.autofocus.rivals import RIVALS, Task
+from studies.autofocus.baselines import BASELINES, Task
 from studies.autofocus.scenes import RANGE, SIZE, Scene, SceneCamera, draw_scene
 from studies.autofocus.trials import COARSE_STEP, RATE, READ_OUT, SETTLE, SLEW, model_of, search_of
 
@@ -85,8 +85,8 @@ class Stage:
         """Focus error over time, in depths of focus."""
         times, places = np.array(self._taken).T
         grid = np.arange(0, SECONDS, 0.005)
-        stood = places[np.minimum(np.searchsorted(times, grid), len(places) - 1)]
-        return np.abs(stood - [self.focus(t) for t in grid]) / self.scene.depth_of_focus
+        positions = places[np.minimum(np.searchsorted(times, grid), len(places) - 1)]
+        return np.abs(positions - [self.focus(t) for t in grid]) / self.scene.depth_of_focus
 
 
 def track(stage: Stage, by_optics: bool = True) -> None:
@@ -121,7 +121,7 @@ def search_anew(stage: Stage) -> None:
         other = other + 1 if abs(sharpness - normal) > TRACKED.drop * normal else 0
         if other < TRACKED.patience:
             continue
-        search = RIVALS["contrast rules"](Task(-RANGE, RANGE, stage.place, COARSE_STEP * depth, depth))
+        search = BASELINES["contrast rules"](Task(-RANGE, RANGE, stage.place, COARSE_STEP * depth, depth))
         try:
             place = next(search)
             while stage.running:

@@ -75,9 +75,9 @@ class Plate:
         if search.current.peak is None:
             return search.measured, math.inf
         sag = self._bench._interferometer.true_sag(self._displacement(search.current.peak.curvature))
-        stands = curvature_of_defocus(self._bench.measurement_of(sag).coefficients[DEFOCUS], self._radius)
+        reached = curvature_of_defocus(self._bench.measurement_of(sag).coefficients[DEFOCUS], self._radius)
         wanted = FocusOptics.from_rest_distance(camera.rest_distance).curvature_for(dioptre)
-        return search.measured, abs(stands - wanted) / depth
+        return search.measured, abs(reached - wanted) / depth
 
 
 def main() -> None:

@@ -136,10 +136,10 @@ class SceneCamera:
         """An image (SIZE, SIZE) after a move to a curvature [1/m]."""
         self.images += 1
         scene, rng = self.scene, self._rng
-        stands = curvature + scene.move_error * rng.standard_normal()
+        reached = curvature + scene.move_error * rng.standard_normal()
         ideal = np.ones((SIZE, SIZE))
         if self._layers:
-            total = sum(texture * self._transfer(stands - place) for texture, place in self._layers)
+            total = sum(texture * self._transfer(reached - place) for texture, place in self._layers)
             fine = fft.irfft2(total, (self._fine, self._fine))
             ideal = np.maximum(fine.reshape(SIZE, FINER, SIZE, FINER).mean((1, 3)), 0)
         flicker = 1 + 0.04 * rng.standard_normal()

@@ -15,7 +15,7 @@ from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
 from dm_autofocus.search.peak_search import NOISE_POINTS, PeakSearch, SearchConfig
 from dm_autofocus.sharpness import cut, tenengrad
-from studies.autofocus.rivals import RIVALS, Task
+from studies.autofocus.baselines import BASELINES, Task
 from studies.autofocus.scenes import RANGE, Scene, SceneCamera, draw_scene
 
 #: Names of our search and of its predecessor, which sweeps the range, each sweep from its low end.
@@ -76,10 +76,10 @@ def search_of(scene: Scene) -> SearchConfig:
 
 def model_of(scene: Scene) -> DefocusModel:
     """Model of the camera of a scene, with the wrong parameters that the search is given."""
-    told = FocusLens(
+    assumed = FocusLens(
         scene.aperture_radius * scene.misinformed[1], scene.wavelength, scene.focal_length_px * scene.misinformed[0]
     )
-    return DefocusModel((scene.region_px,) * 2, told, 2 * RANGE + BEYOND * scene.depth_of_focus)
+    return DefocusModel((scene.region_px,) * 2, assumed, 2 * RANGE + BEYOND * scene.depth_of_focus)
 
 
 def _few_images(stage: _Stage) -> tuple[float | None, str]:
@@ -102,11 +102,11 @@ def _sweep_from_below(stage: _Stage) -> tuple[float | None, str]:
     return (search.peak.curvature if search.peak else None), ""
 
 
-def _rival(name: str) -> Callable[[_Stage], tuple[float | None, str]]:
+def _baseline(name: str) -> Callable[[_Stage], tuple[float | None, str]]:
     def run(stage: _Stage) -> tuple[float | None, str]:
         scene = stage.camera.scene
         depth = scene.depth_of_focus
-        search = RIVALS[name](Task(-RANGE, RANGE, scene.start, COARSE_STEP * depth, depth))
+        search = BASELINES[name](Task(-RANGE, RANGE, scene.start, COARSE_STEP * depth, depth))
         try:
             place = next(search)
             while True:
@@ -121,7 +121,7 @@ def _rival(name: str) -> Callable[[_Stage], tuple[float | None, str]]:
 METHODS: dict[str, Callable[[_Stage], tuple[float | None, str]]] = {
     OURS: _few_images,
     BEFORE: _sweep_from_below,
-    **{name: _rival(name) for name in RIVALS},
+    **{name: _baseline(name) for name in BASELINES},
 }
 
 

@@ -41,7 +41,7 @@ def maps(pixels: int, count: int, generator: np.random.Generator) -> tuple[list[
     return [sag + 1e-9 * generator.normal(size=sag.shape) for _ in range(count)], mask
 
 
-class Ring:
+class CyclicMaps:
     """Gives the next of some maps at every call: too many to fit in the caches, so that each comes from memory."""
 
     def __init__(self, items: list[Floats], start: int = 0) -> None:

@@ -79,13 +79,13 @@ def _sequence(
     """The outcome of the requests in order, and then the drift of a shape held for an hour, m."""
     mirror = DrivenMirror(bench, variant.loop, variant.holds, variant.book)
     targets = [FocusTarget(float(c)) for c in curvatures]
-    upper, stands = [], []
+    upper, displacements = [], []
     for target, dwell in zip(targets, dwells, strict=True):
         move = mirror.go(mirror.plan(target))
         mirror.hold(move, float(dwell))
         upper.append(move.plan.max_zernike_upper)
-        stands.append(bench.true_displacement)
-    errors, rms = surface.errors(np.array(stands), targets)
+        displacements.append(bench.true_displacement)
+    errors, rms = surface.errors(np.array(displacements), targets)
     requests = Requests(dwells, curvatures, np.abs(errors).max(axis=1), np.array(upper), rms, limits)
     return requests, _drift(mirror, surface)
 
@@ -94,13 +94,13 @@ def _drift(mirror: DrivenMirror, surface: TrueSurface) -> float:
     """Largest change of a coefficient while a shape is held for HOLD_S, from HOLD_FROM_S after the move on, m."""
     target = FocusTarget(HOLD_CURVATURE)
     move = mirror.go(mirror.plan(target))
-    stands = []
+    displacements = []
     began = mirror.bench.time
     mirror.hold(move, HOLD_FROM_S)
-    stands.append(mirror.bench.true_displacement)
+    displacements.append(mirror.bench.true_displacement)
     mirror.hold(move, HOLD_S - (mirror.bench.time - began))
-    stands.append(mirror.bench.true_displacement)
-    errors, _ = surface.errors(np.array(stands), [target] * len(stands))
+    displacements.append(mirror.bench.true_displacement)
+    errors, _ = surface.errors(np.array(displacements), [target] * len(displacements))
     return float(np.abs(errors[-1] - errors[0]).max())
 
 

@@ -119,7 +119,7 @@ def _restarted(
     return DrivenMirror(bench, active.planner, seen=seen, record=record)
 
 
-class _KeptTrue:
+class _UpdatedCalibration:
     """A calibration updated by every map, as the node `calibration` does with those of checks and of recipes."""
 
     def __init__(self, bench: SimulatedBench, calibration: Calibration, folder: str) -> None:
@@ -141,12 +141,12 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
     mirror = draw_mirror(seed, options.pixels)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            return _judged(mirror, options, folder, progress)
+            return _evaluated(mirror, options, folder, progress)
     except (Refusal, ValueError) as error:
         return Outcome(mirror, failure=str(error))
 
 
-def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progress: Progress) -> Outcome:
+def _evaluated(mirror: DrawnMirror, options: PopulationOptions, folder: str, progress: Progress) -> Outcome:
     """Calibrate and judge one mirror; the updates of its calibration by later maps are kept in `folder`.
 
     Raises:
@@ -170,12 +170,12 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progre
         raise ValueError("no curvature is reachable: the figure takes the whole range")
     groups: dict[str, Requests] = {}
     book, unreachable = NO_RECIPES, list[str]()
-    kept = _KeptTrue(bench, calibration, folder)
+    updated = _UpdatedCalibration(bench, calibration, folder)
     if options.recipes:
         progress(f"seed {seed}: recipes")
         curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
-        book, unreachable = build_recipes(bench, active.planner, curvatures, kept.take)
-        active = kept.active()
+        book, unreachable = build_recipes(bench, active.planner, curvatures, updated.take)
+        active = updated.active()
     _age(bench, mirror, rng)
 
     progress(f"seed {seed}: any order")
@@ -191,7 +191,7 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progre
     short = np.resize(DWELLS[:4], FIRST_REQUESTS)
     record = driven.record()  # the last before the move
     other.power_cut(driven.plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
-    driven = _restarted(other, kept.active(), float(10.0 ** rng.uniform(0, 3.5)), record)
+    driven = _restarted(other, updated.active(), float(10.0 ** rng.uniform(0, 3.5)), record)
     groups[POWER_CUT] = judge_requests(driven, active, surface, first[1:], short)
 
     progress(f"seed {seed}: restart")
@@ -199,13 +199,13 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progre
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     driven = DrivenMirror(other, active.planner)
     driven.hold(driven.go(driven.plan(first[0])), HELD_S)
-    driven = _restarted(other, kept.active(), OFF_S, driven.record())
+    driven = _restarted(other, updated.active(), OFF_S, driven.record())
     groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
     progress(f"seed {seed}: check maps")
     for target in draw_targets(active, CHECK_MAPS, rng):
         driven.hold(driven.go(driven.plan(target)), other.config.settle_time)
-        kept.take(other.measure("check"), driven.settled())
-    checked = kept.active()
+        updated.take(other.measure("check"), driven.settled())
+    checked = updated.active()
     first = draw_targets(checked, FIRST_REQUESTS, rng)
     driven = driven.under(checked.planner, checked.calibration.creep_shown)
     groups[CHECKED] = judge_requests(driven, checked, surface, first, short)
@@ -213,12 +213,12 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, folder: str, progre
     groups[RECIPES] = Requests.none(unreachable)
     if book.recipes:
         progress(f"seed {seed}: by recipes")
-        asked = [recipe.curvature for recipe in book.recipes]
-        asked += rng.uniform(asked[0], asked[-1], (PER_RECIPE - 1) * len(asked)).tolist()
-        targets = [FocusTarget(float(curvature)) for curvature in rng.permutation(asked)]
+        requested = [recipe.curvature for recipe in book.recipes]
+        requested += rng.uniform(requested[0], requested[-1], (PER_RECIPE - 1) * len(requested)).tolist()
+        targets = [FocusTarget(float(curvature)) for curvature in rng.permutation(requested)]
         driven = DrivenMirror(bench.fork(), active.planner, book=book)
-        judged = judge_requests(driven, active, surface, targets, np.resize(DWELLS[:4], len(targets)))
-        groups[RECIPES] = replace(judged, refusals=(*judged.refusals, *unreachable))
+        result = judge_requests(driven, active, surface, targets, np.resize(DWELLS[:4], len(targets)))
+        groups[RECIPES] = replace(result, refusals=(*result.refusals, *unreachable))
     return Outcome(
         mirror,
         hysteresis.name,

@@ -94,7 +94,7 @@ def judge_requests(
     dwells: Floats,
 ) -> Requests:
     """Carry out the requests in order, and judge the true surface after each dwell."""
-    served, kept, upper, stands, refusals = [], [], [], [], []
+    served, served_dwells, upper, displacements, refusals = [], [], [], [], []
     for target, dwell in zip(targets, dwells, strict=True):
         try:
             move = driven.plan(target)
@@ -106,10 +106,10 @@ def judge_requests(
             refusals.append(str(error))
             continue
         served.append(target)
-        kept.append(dwell)
+        served_dwells.append(dwell)
         upper.append(move.plan.max_zernike_upper)
-        stands.append(driven.bench.true_displacement)
+        displacements.append(driven.bench.true_displacement)
     if not served:
         return Requests.none(refusals)
-    errors, _ = surface.errors(np.array(stands), served)
-    return Requests(np.abs(errors).max(axis=1), np.array(upper), np.array(kept), tuple(refusals))
+    errors, _ = surface.errors(np.array(displacements), served)
+    return Requests(np.abs(errors).max(axis=1), np.array(upper), np.array(served_dwells), tuple(refusals))

@@ -107,7 +107,7 @@ def zeros(message: Any) -> set[str]:
     return found
 
 
-class Asker(Connection):
+class InterfaceCaller(Connection):
     """Calls every interface; see `Connection`."""
 
     def __init__(self, domain: int | None) -> None:
@@ -124,7 +124,7 @@ class Asker(Connection):
         self.node.create_subscription(Log, "/rosout", self._log.append, 1000)
         self.start()
 
-    def ask(self, name: str, values: str, names: Mapping[str, str]) -> Answer:
+    def try_case(self, name: str, values: str, names: Mapping[str, str]) -> Answer:
         """Try one case."""
         kind, fields = (CASES | BENCH)[name][0], parsed(values, names)
         if name in ANSWERED_ON:
@@ -137,7 +137,7 @@ class Asker(Connection):
         assert not code or zeros(answer) <= KNOWN, f"{name}: {values}: {zeros(answer) - KNOWN} = 0, not NaN"
         return Answer(name, values, code, answer.message)
 
-    def tell(self, topic: str) -> Answer:
+    def try_topic(self, topic: str) -> Answer:
         """Publish wrong values on a topic with data until the receiving node reports them in its log."""
         kind, values, node = TOPICS[topic]
         messages = {name: part() for name, part in MAP.items() if topic in MAP}
@@ -209,26 +209,28 @@ def run() -> Iterator[Answer]:
             )
             last = max((folder / "maps").iterdir(), key=lambda path: path.stat().st_mtime)
             names = {"LONG": "x" * 5000, "IN_USE": done.id, "LAST_MAP": str(last)}
-            asker = Asker(domain)
+            caller = InterfaceCaller(domain)
             try:
                 for name, (_, cases) in CASES.items():
-                    yield from (asker.ask(name, values, names) for values in cases)
+                    yield from (caller.try_case(name, values, names) for values in cases)
                     time.sleep(0.2)  # for a move that the last case began
-                yield asker.ask("hold_mirror", HOLD, names)
+                yield caller.try_case("hold_mirror", HOLD, names)
                 for name, cases in HELD.items():
-                    asker.ask("hold_mirror", HOLD, names)  # the last case took the mirror over
-                    yield from (asker.ask(name, values, names) for values in cases)
-                nodes = Nodes(asker)
+                    caller.try_case("hold_mirror", HOLD, names)  # the last case took the mirror over
+                    yield from (caller.try_case(name, values, names) for values in cases)
+                nodes = Nodes(caller)
                 nodes.check_every_parameter()
                 yield from (
                     Answer(f"/{node} {name}", str(value), None, nodes.put(node, name, value) or "set")
                     for node, name, value in SHOWN
                 )
                 yield from (Answer(*answer) for answer in nodes.at_rest())
-                yield from map(asker.tell, TOPICS)
-                yield from (asker.ask(name, values, names) for name, (_, cases) in BENCH.items() for values in cases)
+                yield from map(caller.try_topic, TOPICS)
+                yield from (
+                    caller.try_case(name, values, names) for name, (_, cases) in BENCH.items() for values in cases
+                )
             finally:
-                asker.close()
+                caller.close()
 
 
 def section(answers: Iterator[Answer]) -> str:

@@ -58,7 +58,7 @@ class Nodes:
         self._node = connection.node
         self._clients: dict[str, Any] = {}
 
-    def ask(self, kind: Any, name: str, request: Any) -> Any:
+    def call_service(self, kind: Any, name: str, request: Any) -> Any:
         """The answer of a service."""
         if name not in self._clients:
             self._clients[name] = self._node.create_client(kind, name)
@@ -69,7 +69,7 @@ class Nodes:
         return self._put(node, Parameter(name, value=value).to_parameter_msg())
 
     def _put(self, node: str, message: Message) -> str:
-        (result,) = self.ask(
+        (result,) = self.call_service(
             SetParameters, f"{node}/set_parameters", SetParameters.Request(parameters=[message])
         ).results
         return "" if result.successful else result.reason
@@ -87,14 +87,14 @@ class Nodes:
                     reason = self.put(node.name, name, value)
                     assert name in reason, f"{node.name}: {name} = {value!r}: {reason!r}"
                 request = GetParameters.Request(names=[name])
-                (now,) = self.ask(GetParameters, f"{node.name}/get_parameters", request).values
+                (now,) = self.call_service(GetParameters, f"{node.name}/get_parameters", request).values
                 again = self._put(node.name, Message(name=name, value=now))
                 fixed = name in again and "read-only" in again and not parameter.live  # for the life of the process
                 assert not again or fixed, f"{node.name}: {name}: {again!r}"
 
     def change(self, node: str, transition: int) -> None:
         """Have a node change its state."""
-        answer = self.ask(
+        answer = self.call_service(
             ChangeState, f"{node}/change_state", ChangeState.Request(transition=Transition(id=transition))
         )
         assert answer.success, f"{node}: transition {transition}"
@@ -103,6 +103,6 @@ class Nodes:
         """Interface, state, code and sentence of requests to nodes that are not active."""
         for node, name, kind in AT_REST:
             self.change(node, Transition.TRANSITION_DEACTIVATE)
-            answer = self.ask(kind, name, kind.Request())
+            answer = self.call_service(kind, name, kind.Request())
             self.change(node, Transition.TRANSITION_ACTIVATE)
             yield name, f"{node} is inactive", answer.error_code, answer.message

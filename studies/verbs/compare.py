@@ -138,9 +138,9 @@ def compare(
         raise typer.BadParameter("only with --mirrors, and without --quick", param_hint="--maps")
     table = next(name for name in TABLES if not name or context.params[name])
     for name in context.params.keys() - {table, *TABLES[table], "seed", "json"}:
-        asked = context.params[name] if name in TABLES else True  # 0 asks for no table
+        given = context.params[name] if name in TABLES else True  # 0 asks for no table
         source = context.get_parameter_source(name)
-        if asked and source is not None and source.name == "COMMANDLINE":
+        if given and source is not None and source.name == "COMMANDLINE":
             hint = f"--{name.replace('_', '-')}"
             raise typer.BadParameter(f"without effect {f'with --{table}' if table else 'alone'}", param_hint=hint)
     if mirrors or autofocus:

@@ -23,7 +23,7 @@ from studies.benchmarks import rivals
 from studies.benchmarks.jobs.influence_maps import peak_memory
 from studies.benchmarks.page import growth_table, target_table
 from studies.benchmarks.ros_jobs.request_to_command import FocusPeer
-from studies.benchmarks.ros_jobs.ros_processes import laboratory
+from studies.benchmarks.ros_jobs.ros_processes import process_harness
 from studies.benchmarks.suite import JOBS, run
 from studies.benchmarks.targets import TARGETS, rows
 from studies.benchmarks.timing import Effort, medians
@@ -151,10 +151,10 @@ def test_what_cannot_be_measured_is_refused_before_anything_is_installed(
 
 def test_the_stand_ins_of_a_request_make_the_controller_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_HOME", str(tmp_path))
-    with laboratory() as room:
-        controller = BackgroundExecutor(FocusControllerNode(context=room.node.context, namespace="focus"))
-        peer = FocusPeer(room, "focus")
-        room.wait_for("the focus controller", peer.connected)
+    with process_harness() as harness:
+        controller = BackgroundExecutor(FocusControllerNode(context=harness.node.context, namespace="focus"))
+        peer = FocusPeer(harness, "focus")
+        harness.wait_for("the focus controller", peer.connected)
         peer.calibrate()
         assert math.isfinite(peer.round_trip(0.01))
         controller.destroy_node()

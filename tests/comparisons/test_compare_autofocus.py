@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from studies.autofocus.baselines import BASELINES, Task
 from studies.autofocus.photographs import Plate
-from studies.autofocus.rivals import RIVALS, Task
 from studies.autofocus.scenes import PHOTOGRAPH, RANGE, TEXTURES, SceneCamera, draw_scene
 from studies.autofocus.trials import OURS, figures_of, run_drawn, run_scene
 from studies.verbs.compare_autofocus import show
 
 
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize("start", [-0.05, -0.01, 0.03])
 def test_every_rival_finds_a_wide_hill_without_noise(name: str, start: float) -> None:
-    search = RIVALS[name](Task(-RANGE, RANGE, start, 0.008, 0.001))
+    search = BASELINES[name](Task(-RANGE, RANGE, start, 0.008, 0.001))
     place = next(search)
     with pytest.raises(StopIteration) as end:
         while True:

@@ -73,7 +73,7 @@ def test_a_mirror_that_cannot_be_driven_fails_by_itself(
     def refused(*_: object) -> None:
         raise ValueError("no curvature is reachable")
 
-    monkeypatch.setattr(population, "_judged", refused)
+    monkeypatch.setattr(population, "_evaluated", refused)
     (outcome,) = judge_population([3], PopulationOptions(pixels=100))
     assert outcome.failure == "no curvature is reachable"
     show([row_of(outcome)])

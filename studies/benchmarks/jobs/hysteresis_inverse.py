@@ -20,7 +20,7 @@ from studies.benchmarks.jobs.scaling import ACTUATORS
 from studies.benchmarks.timing import Effort, medians
 
 #: Number of earlier moves, and time after the last of them at which the inverse is computed, s.
-MOVES, ASKED_S = 12, 10.0
+MOVES, DELAY_S = 12, 10.0
 REACH = 0.03  # 1/m
 #: Amplitudes of earlier moves and of aims: inside the limits, so that no branch of code is left out or always taken.
 SWING, AIM = 0.7, 0.6
@@ -54,8 +54,8 @@ def _law(
 ) -> dict[str, float]:
     """Times in ms for one law; `worst_signal` is the largest difference of the prepared inverse from the other."""
     state = _state(law, 37, generator)
-    asked = state.time + ASKED_S
-    at = law.advance(state, asked)
+    start = state.time + DELAY_S
+    at = law.advance(state, start)
     aims = iter(generator.uniform(-AIM, AIM, (20 * effort.rounds + 100, 37)))
     curvatures = iter(generator.uniform(-REACH, REACH, 20 * effort.rounds + 100))
     ready = PreparedInverse(law, state, Limits())
@@ -66,18 +66,18 @@ def _law(
     wanted = FocusTarget(REACH).coefficients(model.aperture_radius)[3:]
     jobs = {
         "ms": lambda: invert(law, at, next(aims), -1.0, 1.0, SETTLE_S),
-        "prepared_ms": lambda: ready.invert(asked, next(aims), SETTLE_S),
+        "prepared_ms": lambda: ready.invert(start, next(aims), SETTLE_S),
         "prepare_ms": lambda: PreparedInverse(law, state, Limits()),
-        "plan_ms": lambda: cold.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
-        "plan_prepared_ms": lambda: warm.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
+        "plan_ms": lambda: cold.plan(FocusTarget(next(curvatures)), state, start, ahead=SETTLE_S).signals,
+        "plan_prepared_ms": lambda: warm.plan(FocusTarget(next(curvatures)), state, start, ahead=SETTLE_S).signals,
         "linear_ms": lambda: np.clip(gain @ wanted, -1.0, 1.0),
     }
     result = {name: 1e3 * seconds for name, seconds in medians(jobs, 5 * effort.rounds).items()}
     aim = next(aims)
-    prepared = ready.invert(asked, aim, SETTLE_S)
+    prepared = ready.invert(start, aim, SETTLE_S)
     difference = 0.0 if prepared is None else np.abs(prepared - invert(law, at, aim, -1.0, 1.0, SETTLE_S).signals).max()
     reached = law.effective(
-        law.advance(law.move(at, invert(law, at, aim, -1.0, 1.0, SETTLE_S).signals, asked), asked + SETTLE_S)
+        law.advance(law.move(at, invert(law, at, aim, -1.0, 1.0, SETTLE_S).signals, start), start + SETTLE_S)
     )
     return result | {"worst_signal": float(difference), "worst_effective": float(np.abs(reached - aim).max())}
 
@@ -87,7 +87,7 @@ def _growth(
 ) -> dict[str, float]:
     entry: dict[str, float] = {"actuators": actuators}
     for name, law in laws.items():
-        at = law.advance(_state(law, actuators, generator), MOVES + ASKED_S)
+        at = law.advance(_state(law, actuators, generator), MOVES + DELAY_S)
         aim = generator.uniform(-AIM, AIM, actuators)
         job = partial(invert, law, at, aim, -1.0, 1.0, SETTLE_S)
         entry[name] = 1e3 * medians({"x": job}, effort.rounds)["x"]

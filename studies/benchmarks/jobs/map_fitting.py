@@ -14,7 +14,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import TERMS, basis, to_born_wolf
-from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
+from studies.benchmarks.sample_maps import CAMERA, CyclicMaps, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
 from studies.paper.regions import ConcentricRegions, residual_map, squared_distance
 
@@ -34,9 +34,9 @@ def measure(effort: Effort, rivals: dict[str, ModuleType]) -> dict[str, Any]:
     fits: dict[str, Fit] = {"fit": lambda sag: fitter.fit(sag).coefficients, "lstsq": _numpy_fit(mask)}
     fits |= {name: make(mask, rivals[name]) for name, make in _RIVALS.items() if name in rivals}
 
-    ring, read, other = Ring(some), Ring(some, MAPS // 2), Ring(some)
+    cycle, read, other = CyclicMaps(some), CyclicMaps(some, MAPS // 2), CyclicMaps(some)
     jobs: dict[str, Callable[[], object]] = {
-        "fit": lambda: fits["fit"](ring()),
+        "fit": lambda: fits["fit"](cycle()),
         "read": lambda: _read(read()),
     }
     jobs |= {name: partial(_fit_next, fit, other) for name, fit in fits.items() if name != "fit"}
@@ -65,8 +65,8 @@ def measure(effort: Effort, rivals: dict[str, ModuleType]) -> dict[str, Any]:
     }
 
 
-def _fit_next(fit: Fit, ring: Ring) -> Floats:
-    return fit(ring())
+def _fit_next(fit: Fit, cycle: CyclicMaps) -> Floats:
+    return fit(cycle())
 
 
 def _read(sag: Floats) -> float:
@@ -79,10 +79,10 @@ def _new_mask(effort: Effort, generator: np.random.Generator) -> dict[str, Any]:
     centre, radius = (CAMERA - 1) / 2, CAMERA / 2
     base, _mask = maps(CAMERA, 1, generator)
     several = [np.where(mask_of(CAMERA, generator), base[0], np.nan) for _ in range(MAPS // 2)]
-    ring = Ring(several)
+    cycle = CyclicMaps(several)
 
     def fit() -> Floats:
-        sag = ring()
+        sag = cycle()
         return MapFitter(np.isfinite(sag), centre, centre, radius).fit(sag).coefficients
 
     return {"ms": 1e3 * medians({"fit": fit}, effort.rounds)["fit"]}
@@ -93,7 +93,7 @@ def _regions(effort: Effort, fitter: MapFitter, some: list[Floats]) -> dict[str,
     shape, aperture = residuals[0].shape, fitter.aperture
     regions = ConcentricRegions(shape, aperture)
     discs = [squared_distance(aperture, shape) <= fraction for fraction in AREA_FRACTIONS]
-    ours, theirs = Ring(residuals), Ring(residuals)
+    ours, theirs = CyclicMaps(residuals), CyclicMaps(residuals)
 
     def ten_passes() -> Floats:
         residual = theirs()

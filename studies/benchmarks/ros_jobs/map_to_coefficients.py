@@ -26,7 +26,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_common.ros import qos
 from dm_simulation.interferometer.zygo_files import encode_dat, encode_datx
-from studies.benchmarks.ros_jobs.ros_processes import Laboratory, laboratory
+from studies.benchmarks.ros_jobs.ros_processes import ProcessHarness, process_harness
 from studies.benchmarks.sample_maps import CAMERA, full_aperture, maps
 from studies.benchmarks.timing import Effort, medians
 
@@ -51,8 +51,8 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
         for suffix, encode in (("dat", encode_dat), ("datx", encode_datx))
     }
     rounds = 10 if effort.quick else 200
-    with laboratory() as room:
-        node = _Interferometer(room)
+    with process_harness() as harness:
+        node = _Interferometer(harness)
         named = {suffix: [node.named(some[0], suffix) for _ in range(2)] for suffix, some in contents.items()}
         # One kind after the other: after a .datx, the helper process for the next one starts, beside whatever follows.
         for suffix, some in contents.items():
@@ -71,33 +71,33 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
 class _Interferometer:
     """The node under test."""
 
-    def __init__(self, room: Laboratory) -> None:
-        self._room, self._numbers = room, count()
+    def __init__(self, harness: ProcessHarness) -> None:
+        self._harness, self._numbers = harness, count()
         self._arrived: list[float] = []
-        self._folder = room.folder / "maps"
+        self._folder = harness.folder / "maps"
         self._folder.mkdir()
-        room.node.create_subscription(
+        harness.node.create_subscription(
             ZernikeCoefficients, "/maps/zernike", lambda _message: self._arrived.append(time.perf_counter()), qos.STATE
         )
-        self._ingest = room.node.create_client(IngestFile, "/maps/ingest_file")
+        self._ingest = harness.node.create_client(IngestFile, "/maps/ingest_file")
         parameters = {"watch_folder": str(self._folder), "aperture.radius": RADIUS}
-        room.start(MODULES["interferometer"], namespace="maps", parameters=parameters)
-        room.wait_for("the interferometer", lambda: room.node.count_publishers("/maps/zernike"))
-        room.wait_for("its service", self._ingest.service_is_ready)
-        room.serve(1.0)
+        harness.start(MODULES["interferometer"], namespace="maps", parameters=parameters)
+        harness.wait_for("the interferometer", lambda: harness.node.count_publishers("/maps/zernike"))
+        harness.wait_for("its service", self._ingest.service_is_ready)
+        harness.serve(1.0)
 
     def named(self, content: bytes, suffix: str) -> float:
         """Time from naming a new file to its coefficients, s."""
-        path = self._room.folder / f"{next(self._numbers)}.{suffix}"
+        path = self._harness.folder / f"{next(self._numbers)}.{suffix}"
         path.write_bytes(content)
         self._arrived.clear()
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         answer = self._ingest.call_async(IngestFile.Request(path=str(path)))
-        return self._await(path, asked, answer.done)
+        return self._await(path, requested, answer.done)
 
     def rest(self) -> None:
         """Wait until all background work is over."""
-        self._room.serve(REST_S)
+        self._harness.serve(REST_S)
 
     def watched(self, content: bytes) -> float:
         """Time from the moment a new file is closed to its coefficients, s."""
@@ -109,9 +109,9 @@ class _Interferometer:
         return self._await(path, closed, lambda: True)
 
     def _await(self, path: Path, since: float, done: Callable[[], bool]) -> float:
-        self._room.wait_for(f"coefficients of {path.name}", lambda: self._arrived and done(), ARRIVAL_S)
+        self._harness.wait_for(f"coefficients of {path.name}", lambda: self._arrived and done(), ARRIVAL_S)
         seconds = self._arrived[0] - since
-        self._room.serve(PAUSE_S)
+        self._harness.serve(PAUSE_S)
         path.unlink()
         return seconds
 
@@ -123,11 +123,11 @@ def _percentiles(seconds: list[float]) -> dict[str, float]:
 
 def _parts(contents: dict[str, list[bytes]], effort: Effort) -> dict[str, float]:
     """Medians of the steps, ms, in this process."""
-    with laboratory() as room:
+    with process_harness() as harness:
         paths: dict[str, list[Path]] = {suffix: [] for suffix in contents}
         for suffix, some in contents.items():
             for number, content in enumerate(some):
-                paths[suffix].append(room.folder / f"{number}.{suffix}")
+                paths[suffix].append(harness.folder / f"{number}.{suffix}")
                 paths[suffix][-1].write_bytes(content)
         turn = iter(range(10**9))
 

@@ -21,7 +21,7 @@ from dm_common import Floats
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from studies.benchmarks import stand_in_mirror
-from studies.benchmarks.ros_jobs.ros_processes import Laboratory, laboratory
+from studies.benchmarks.ros_jobs.ros_processes import ProcessHarness, process_harness
 from studies.benchmarks.timing import Effort
 
 #: Class of the hysteresis model in the calibration.
@@ -50,12 +50,12 @@ class Peer:
         answers: commands in order, each with its time of arrival, ns.
     """
 
-    room: Laboratory
+    harness: ProcessHarness
     namespace: str
     answers: list[tuple[int, ActuatorCommand]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        node = self.room.node
+        node = self.harness.node
         self.publisher = node.create_publisher(FocusRequest, f"/{self.namespace}/focus_request", qos.COMMAND)
         topic = f"/{self.namespace}/actuator_command"
         self.subscription = node.create_subscription(ActuatorCommand, topic, self._on_command, qos.STATE)
@@ -64,7 +64,7 @@ class Peer:
         self.answers.append((time.perf_counter_ns(), command))
         self.after(command)
 
-    def asked_by(self) -> list[tuple[int, float]]:
+    def answered_curvatures(self) -> list[tuple[int, float]]:
         """Times of the answers (ns) with the curvatures of their requests."""
         return [(when, command.signals[0]) for when, command in self.answers]
 
@@ -74,13 +74,13 @@ class Peer:
     def connected(self) -> bool:
         """Whether the node is connected in both directions."""
         return bool(
-            self.publisher.get_subscription_count() and self.room.node.count_publishers(self.subscription.topic)
+            self.publisher.get_subscription_count() and self.harness.node.count_publishers(self.subscription.topic)
         )
 
     def request(self, curvature: float) -> int:
         """Send a request; returns the time, ns."""
         message = FocusRequest(curvature=curvature)
-        message.header.stamp = self.room.node.get_clock().now().to_msg()
+        message.header.stamp = self.harness.node.get_clock().now().to_msg()
         sent = time.perf_counter_ns()
         self.publisher.publish(message)
         return sent
@@ -89,7 +89,7 @@ class Peer:
         """Time until the command, s; NaN when there was none."""
         self.answers.clear()
         sent = self.request(curvature)
-        self.room.serve(ANSWER_S, lambda: bool(self.answers))
+        self.harness.serve(ANSWER_S, lambda: bool(self.answers))
         return 1e-9 * (self.answers[0][0] - sent) if self.answers else float("nan")
 
 
@@ -98,7 +98,7 @@ class FocusPeer(Peer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        node, prefix = self.room.node, f"/{self.namespace}"
+        node, prefix = self.harness.node, f"/{self.namespace}"
         self._info = node.create_publisher(MirrorInfo, f"{prefix}/mirror_info", qos.LATCHED)
         self._calibration = node.create_publisher(Calibration, f"{prefix}/calibration", qos.LATCHED)
         self._state = node.create_publisher(ActuatorState, f"{prefix}/actuator_state", qos.STATE)
@@ -111,10 +111,10 @@ class FocusPeer(Peer):
         self._reported: ActuatorState | None = None
         node.create_timer(REPORT_PERIOD_S, lambda: self._reported and self._state.publish(self._reported))
 
-    def asked_by(self) -> list[tuple[int, float]]:
-        asked = {_ns(state.header.stamp): state.curvature for state in self.focus_states if state.applied}
+    def answered_curvatures(self) -> list[tuple[int, float]]:
+        curvature_at = {_ns(state.header.stamp): state.curvature for state in self.focus_states if state.applied}
         stamped = [(when, _ns(command.header.stamp)) for when, command in self.answers]
-        return [(when, asked[stamp]) for when, stamp in stamped if stamp in asked]
+        return [(when, curvature_at[stamp]) for when, stamp in stamped if stamp in curvature_at]
 
     def after(self, command: ActuatorCommand) -> None:
         self._turns += 1
@@ -130,7 +130,7 @@ class FocusPeer(Peer):
             degausses=self._degausses,
             history_known=self._degausses > 0,
         )
-        report.header.stamp = self.room.node.get_clock().now().to_msg()
+        report.header.stamp = self.harness.node.get_clock().now().to_msg()
         self._reported = report
         self._state.publish(report)
 
@@ -139,13 +139,13 @@ class FocusPeer(Peer):
         self._info.publish(stand_in_mirror.mirror_info())
         self._calibration.publish(stand_in_mirror.calibration(LAW))
         self._report(doubles(np.zeros(37)))  # nothing is reachable without a driver that reports
-        self.room.wait_for(
+        self.harness.wait_for(
             "the controller's calibration",
             lambda: self._capabilities and self._capabilities[-1].quality == Capabilities.CALIBRATED,
         )
         self._degausses = 1
         self._report(doubles(np.zeros(37)))
-        self.room.serve(0.5)
+        self.harness.serve(0.5)
 
 
 def _ns(stamp: Any) -> int:
@@ -160,17 +160,17 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     """
     generator = np.random.default_rng(500)
     blocks = 2 if effort.quick else 16
-    with laboratory() as room:
-        relay, focus = _started(room, "events"), _controller(room)
+    with process_harness() as harness:
+        relay, focus = _started(harness, "events"), _controller(harness)
         _collected([relay, focus], WARM_UP, generator)
         turns = [_collected([relay, focus], BLOCK, generator) for _ in range(blocks)]
         camera = [_collected([relay, focus], BLOCK, generator, CAMERA_PAUSE_S) for _ in range(max(blocks // 4, 2))]
         stream = {
-            name: _stream(room, peer, 2.0 if effort.quick else 10.0, generator)
+            name: _stream(harness, peer, 2.0 if effort.quick else 10.0, generator)
             for name, peer in (("relay", relay), ("focus", focus))
         }
-    with laboratory() as room:
-        peers = [_started(room, kind) for kind in EXECUTORS]
+    with process_harness() as harness:
+        peers = [_started(harness, kind) for kind in EXECUTORS]
         _collected(peers, WARM_UP, generator)
         # The multi-threaded executor of Jazzy slows down whatever runs beside it, so it comes only here.
         executors = [_collected(peers, BLOCK, generator, CAMERA_PAUSE_S) for _ in range(1 if effort.quick else 4)]
@@ -183,20 +183,20 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     }
 
 
-def _started(room: Laboratory, executor: str) -> Peer:
+def _started(harness: ProcessHarness, executor: str) -> Peer:
     namespace = f"relay_{executor}"
-    room.start("studies.benchmarks.ros_jobs.relay_node", executor, namespace=namespace)
-    peer = Peer(room, namespace)
-    room.wait_for(f"the relay with the executor {executor}", peer.connected)
-    room.serve(0.5)
+    harness.start("studies.benchmarks.ros_jobs.relay_node", executor, namespace=namespace)
+    peer = Peer(harness, namespace)
+    harness.wait_for(f"the relay with the executor {executor}", peer.connected)
+    harness.serve(0.5)
     return peer
 
 
-def _controller(room: Laboratory) -> FocusPeer:
-    room.start(MODULES["focus_controller"], namespace="focus")
-    peer = FocusPeer(room, "focus")
-    room.wait_for("the focus controller", peer.connected)
-    room.serve(0.5)
+def _controller(harness: ProcessHarness) -> FocusPeer:
+    harness.start(MODULES["focus_controller"], namespace="focus")
+    peer = FocusPeer(harness, "focus")
+    harness.wait_for("the focus controller", peer.connected)
+    harness.serve(0.5)
     peer.calibrate()
     return peer
 
@@ -210,7 +210,7 @@ def _collected(peers: list[Peer], rounds: int, generator: np.random.Generator, p
         for turn in range(rounds):
             for row in generator.permutation(len(peers)):
                 seconds[row, turn] = peers[row].round_trip(float(generator.uniform(-REACH, REACH)))
-                peers[row].room.serve(pause_s)
+                peers[row].harness.serve(pause_s)
     finally:
         gc.enable()
     return 1e6 * seconds
@@ -235,17 +235,17 @@ def _ratios(turns: list[Floats]) -> dict[str, float]:
     }
 
 
-def _stream(room: Laboratory, peer: Peer, seconds: float, generator: np.random.Generator) -> dict[str, float]:
+def _stream(harness: ProcessHarness, peer: Peer, seconds: float, generator: np.random.Generator) -> dict[str, float]:
     """Send requests at STREAM_RATE without waiting: how many are answered, and whether answers become later."""
     peer.answers.clear()
     sent: dict[float, int] = {}
     began = time.monotonic()
     for number, curvature in enumerate(generator.uniform(-REACH, REACH, round(seconds * STREAM_RATE))):
-        room.serve(began + number / STREAM_RATE - time.monotonic())
+        harness.serve(began + number / STREAM_RATE - time.monotonic())
         sent[float(curvature)] = peer.request(float(curvature))
     lasted = time.monotonic() - began
-    room.serve(1.0)
-    age = 1e-3 * np.array([when - sent[curvature] for when, curvature in peer.asked_by()])
+    harness.serve(1.0)
+    age = 1e-3 * np.array([when - sent[curvature] for when, curvature in peer.answered_curvatures()])
     quarter = max(len(age) // 4, 1)
     return {
         "rate": len(sent) / lasted,

@@ -23,7 +23,7 @@ from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import make_executor
 
 
-class Laboratory:
+class ProcessHarness:
     """Processes under test and a client node, which this thread serves.
 
     Attributes:
@@ -92,15 +92,15 @@ class Laboratory:
 
 
 @contextlib.contextmanager
-def laboratory() -> Iterator[Laboratory]:
-    """A laboratory on a ROS domain and in a folder of its own."""
+def process_harness() -> Iterator[ProcessHarness]:
+    """A harness on a ROS domain and in a folder of its own."""
     with own_domain() as domain, tempfile.TemporaryDirectory(prefix="dm-bench-") as folder:
-        room = Laboratory(domain, Path(folder))
+        harness = ProcessHarness(domain, Path(folder))
         # A full garbage collection through everything that other jobs have imported would stall the client.
         gc.collect()
         gc.freeze()
         try:
-            yield room
+            yield harness
         finally:
             gc.unfreeze()
-            room.close()
+            harness.close()

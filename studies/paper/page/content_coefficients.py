@@ -114,11 +114,11 @@ def _hysteresis_bound(results: Results) -> str:
     """Two measurements that show what limits a linear model."""
     standard, ideal = results.standard, results.ideal
     radius = standard.samples.bench.mirror.working_radius
-    missed = []
+    errors = []
     for shot in standard.spheres["AZreg", SHOWN].shots:
         start = np.copysign(1.0 / 60.0, 1.0 if shot.start == "p55" else -1.0)
-        asked = (shot.target.curvature - start) * radius**2 / 4.0
-        missed.append(abs(shot.zernike[3] / asked))
+        commanded = (shot.target.curvature - start) * radius**2 / 4.0
+        errors.append(abs(shot.zernike[3] / commanded))
     spread = standard.branch_spread
     return (
         "Why the open loop cannot get there with a linear G. First, a command stands for more than one surface: p55 "
@@ -127,7 +127,7 @@ def _hysteresis_bound(results: Results) -> str:
         f"by {0.5 * spread * NM:.0f} nm ({parts(0.5 * spread)}) at least for one of them; that is what a stored c_ini "
         "meets. Second, when c_ini is measured, the step itself errs: after a turn of direction a piezo moves less for "
         f"the same signal than on average, and G is the average. Defocus missed the step asked for by "
-        f"{np.median(missed):.0%} in the median and by {max(missed):.0%} at most. Only measuring and correcting, or a "
+        f"{np.median(errors):.0%} in the median and by {max(errors):.0%} at most. Only measuring and correcting, or a "
         "model of hysteresis and creep, goes further."
     )
 

@@ -142,7 +142,7 @@ def _vertex(places: np.ndarray, seen: np.ndarray, top: int) -> float:
     return float(places[middle] + np.clip(-slope / (2 * square), x[0], x[-1]))
 
 
-RIVALS = {
+BASELINES = {
     "full sweep": full_sweep,
     "hill climbing": hill_climb,
     "Fibonacci search": fibonacci_search,
