@@ -40,8 +40,8 @@ class VisionNode(Node):
             self.get_logger().warning(f"refused: {state.message}", throttle_duration_sec=1.0)
             return
         # Images stamped from then on show this focus.
-        stands = state.header.stamp.sec + 1e-9 * state.header.stamp.nanosec + state.predicted_duration
-        self.get_logger().info(f"{self._optics.dioptre_for(state.curvature):+.4f} dioptre from {stands:.3f} s on")
+        arrival = state.header.stamp.sec + 1e-9 * state.header.stamp.nanosec + state.predicted_duration
+        self.get_logger().info(f"{self._optics.dioptre_for(state.curvature):+.4f} dioptre from {arrival:.3f} s on")
 
 
 if __name__ == "__main__":

@@ -75,11 +75,11 @@ class FilmedScene:
         self.encoding = "mono8"
         self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
         self._frames: list[Time] = []
-        self._stood: list[int] = []  # first image after each move
+        self._first_settled: list[int] = []  # first image after each move
         self._lock = threading.Lock()
         self._noise = np.random.default_rng(6)
         self._curvature = 0.0
-        self._stands_at = 0.0
+        self._arrival = 0.0
         self._pending: FocusState | None = None
         self.info = self.node.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         self._image = self.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
@@ -138,7 +138,7 @@ class FilmedScene:
         """How many images of the standing mirror came before each that counted."""
         counted = [state for state in self.states if state.phase != AutofocusState.PHASE_IDLE]
         numbers = [self._frames.index(state.header.stamp) for state in counted]
-        return [number - max(first for first in self._stood if first <= number) for number in numbers]
+        return [number - max(first for first in self._first_settled if first <= number) for number in numbers]
 
     def __exit__(self, *_exception: object) -> None:
         self._stop.set()
@@ -170,7 +170,7 @@ class FilmedScene:
         if state.applied:
             with self._lock:
                 self._curvature, self._pending = request.curvature, state
-                self._stands_at = time.monotonic() + MOVE_TIME
+                self._arrival = time.monotonic() + MOVE_TIME
         self._state.publish(state)
 
     def _on_hold(self, request: HoldMirror.Request, response: HoldMirror.Response) -> HoldMirror.Response:
@@ -188,13 +188,13 @@ class FilmedScene:
         while not self._stop.wait(period):
             with self._lock:
                 exposed = self.node.get_clock().now().to_msg()
-                moving = time.monotonic() < self._stands_at
+                moving = time.monotonic() < self._arrival
                 off = 0.0 if moving else abs(self._curvature - self.object_curvature)
                 if self._pending is not None and not moving:
                     report = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, requested=self._pending.signals)
                     report.header.stamp, self._pending = exposed, None
                     self._driver.publish(report)
-                    self._stood.append(len(self._frames))
+                    self._first_settled.append(len(self._frames))
                 self._frames.append(exposed)
             if self.render is not None:
                 self._publish_image(self.render(self._curvature), exposed)

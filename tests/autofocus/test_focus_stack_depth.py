@@ -33,9 +33,9 @@ def test_the_depth_image_comes_with_a_projection() -> None:
     assert (info.header.frame_id, known.header.frame_id) == ("camera", "")
     uncalibrated = CameraInfo(width=640, height=480, binning_x=2, binning_y=2)
     for silent in (None, uncalibrated):
-        told = camera_info_for(image, silent, 400.0)
-        assert (told.width, told.height, told.k[0], told.p[0], told.p[2]) == (320, 240, 400.0, 400.0, 159.5)
-        assert told.binning_x == 0
+        info = camera_info_for(image, silent, 400.0)
+        assert (info.width, info.height, info.k[0], info.p[0], info.p[2]) == (320, 240, 400.0, 400.0, 159.5)
+        assert info.binning_x == 0
         assert not any(camera_info_for(image, silent, 0.0).p)
 
 

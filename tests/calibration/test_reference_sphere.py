@@ -38,14 +38,14 @@ def test_what_is_no_radius_is_refused_before_a_map_is_taken(radius: str) -> None
 
 @pytest.mark.parametrize("sphere", [True, False])
 def test_the_map_of_a_sphere_is_published_to_nobody(sphere: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = list[bool]()
+    calls = list[bool]()
 
     def failing(label: str, answer_only: bool) -> None:
-        asked.append(answer_only)
+        calls.append(answer_only)
         raise RuntimeError("no map")
 
     client = SimpleNamespace(measure=failing)
     monkeypatch.setattr(measure, "running_suite", lambda namespace: nullcontext(client))
     words = ["--reference-sphere", "2"] if sphere else []
     assert CliRunner().invoke(cli.app, ["measure", *words]).exit_code == 1
-    assert asked == [sphere]
+    assert calls == [sphere]

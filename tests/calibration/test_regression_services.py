@@ -197,10 +197,10 @@ def test_maps_that_do_not_do_are_refused_and_what_was_in_use_stays(node: NodePro
 
 
 def test_why_a_calibration_tells_no_error_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = list[str]()
+    calls = list[str]()
 
     def fitted(*arguments: Any) -> Any:
-        asked.append("fit_predictor")
+        calls.append("fit_predictor")
         return fit_predictor(*arguments)
 
     monkeypatch.setattr(error_prediction, "fit_predictor", fitted)
@@ -211,7 +211,7 @@ def test_why_a_calibration_tells_no_error_is_found_out_once(monkeypatch: pytest.
     request = PredictError.Request(signals=doubles(np.zeros(37)))
     answers = [service.predict(request, PredictError.Response()) for _ in range(3)]
     assert [answer.error_code for answer in answers] == [ErrorCode.TOO_FEW_MAPS] * 3
-    assert len({answer.message for answer in answers}) == 1 and asked == ["fit_predictor"]
+    assert len({answer.message for answer in answers}) == 1 and calls == ["fit_predictor"]
 
 
 def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path: Path) -> None:

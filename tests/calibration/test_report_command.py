@@ -40,10 +40,10 @@ def _nothing_runs(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_newest_is_reported(store: CalibrationStore, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
     report("", tmp_path / "out", store.folder, json=figures)
-    told = json.loads(figures.read_text())
-    assert told["id"] == "newer"
-    assert told["remeasured_max_zernike_nm"] is None
-    assert Path(told["files"]["html"]).name == "newer.html" and Path(told["files"]["pdf"]).is_file()
+    summary = json.loads(figures.read_text())
+    assert summary["id"] == "newer"
+    assert summary["remeasured_max_zernike_nm"] is None
+    assert Path(summary["files"]["html"]).name == "newer.html" and Path(summary["files"]["pdf"]).is_file()
 
 
 def test_an_id_or_a_file_anywhere_is_found(

@@ -59,10 +59,10 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
             text=True,
             timeout=300,
         )
-    told = " ".join((done.stdout + done.stderr).split())
-    assert done.returncode == 1, told
-    assert "actuators 3 and 7 are exchanged" in told and "mirrored left to right, then turned by " in told
-    assert told.count("exchanged") <= 3 and "permuted" not in told, told  # a finding, and the refusal in one sentence
+    text = " ".join((done.stdout + done.stderr).split())
+    assert done.returncode == 1, text
+    assert "actuators 3 and 7 are exchanged" in text and "mirrored left to right, then turned by " in text
+    assert text.count("exchanged") <= 3 and "permuted" not in text, text  # a finding, and the refusal in one sentence
     with (
         own_domain() as domain,
         ForkedSuite(load_config(second), tmp_path, domain),

@@ -258,7 +258,7 @@ class FakeClient:
     def wait(self, condition: Any, _timeout_s: float) -> bool:
         if self._busy and "calibrate/_action/status" in self.node.callbacks:
             goal = Goal(self.node, 1)
-            goal.tell(EXECUTING)
+            goal.publish_status(EXECUTING)
             feedback = SimpleNamespace(step=12, steps=86, residual_rms=0.0)
             self.node.callbacks["calibrate/_action/feedback"](SimpleNamespace(goal_id=goal.identity, feedback=feedback))
         return bool(condition())

@@ -288,8 +288,8 @@ def test_a_port_in_use_is_named() -> None:
         wrong = doctor_bench.taken_ports({"trigger.port": port, "electronics.tcp_port": str(port)})
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
     assert wrong is not None and "electronics.tcp_port" not in wrong.problem  # which the node refuses
-    gone = electronics.opens("edac40_tcp", driver)
-    assert gone is not None and "Connection refused" in gone.problem
+    finding = electronics.opens("edac40_tcp", driver)
+    assert finding is not None and "Connection refused" in finding.problem
 
 
 def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -298,8 +298,8 @@ def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
     config = {node: values for node, values in bench({"pdm_driver": changes}).items() if node != "virtual_bench"}
     save_config(config, tmp_path / "bench.yaml")
     found = {name: run() for name, run in doctor_bench.bench_checks(tmp_path / "bench.yaml")}
-    gone = found["electronics at PYRO:Mirror@127.0.0.1:9"]
-    assert gone is not None and "cannot open deformable mirror at PYRO:Mirror@127.0.0.1:9" in gone.problem
+    finding = found["electronics at PYRO:Mirror@127.0.0.1:9"]
+    assert finding is not None and "cannot open deformable mirror at PYRO:Mirror@127.0.0.1:9" in finding.problem
 
 
 def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,8 +320,8 @@ def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
     held = held_by_the_nodes("electronics at 127.0.0.1:1", refused, running)
     assert held is not None and held.note and held.problem == refused.problem and "./dm status" in held.cure
     without = Finding("running: calibration; not running: pdm_driver (nothing can move the mirror)", "start it", True)
-    told = (("electronics at 127.0.0.1:1", alone), ("electronics at 1", without), ("watched folder /maps", running))
-    for check, others in told:
+    checks = (("electronics at 127.0.0.1:1", alone), ("electronics at 1", without), ("watched folder /maps", running))
+    for check, others in checks:
         assert held_by_the_nodes(check, refused, others) == refused
 
 

@@ -78,7 +78,7 @@ def write_bag(folder: Path, messages: list[tuple[str, Any]]) -> BagReader:
     return BagReader(folder)
 
 
-def told_by(recorder: Recorder) -> int:
+def nodes_recorded(recorder: Recorder) -> int:
     """How many nodes have told their parameters, one that was started anew counted again."""
     return sum(again == math.inf for again in recorder._retry_at.values())
 
@@ -108,8 +108,8 @@ def session_messages(run: RecordedRun) -> list[tuple[str, Any]]:
         ("/mirror_info", mirror_info_of(run.mirror)),
         ("/actuator_state", ActuatorState(requested=rest, applied=rest, turns=7, degausses=2)),
     ]
-    told = Calibrate.Impl.FeedbackMessage(feedback=Calibrate.Feedback(plan=run.plan))
-    messages.append(("/calibrate/_action/feedback", told))
+    message = Calibrate.Impl.FeedbackMessage(feedback=Calibrate.Feedback(plan=run.plan))
+    messages.append(("/calibrate/_action/feedback", message))
     events: list[tuple[int, list[tuple[str, Any]]]] = []
     degausses = 2
     for number, move in enumerate(run.moves, start=8):
@@ -152,8 +152,8 @@ def run_and_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[RecordedRun, 
     message = calibration_message(live, None, "mirror", 32e-9)
     folder = tmp_path_factory.mktemp("bag") / "session"
     values = {parameter.name: parameter.default for parameter in PARAMETERS} | {"poke_amplitude": 0.4}
-    told = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    event = (PARAMETER_EVENTS, ParameterEvent(node="/calibration", new_parameters=told))
+    changes = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    event = (PARAMETER_EVENTS, ParameterEvent(node="/calibration", new_parameters=changes))
     bag = write_bag(folder, [*session_messages(run), event, ("/calibration", message)])
     return run, message, bag
 
@@ -248,8 +248,8 @@ def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any
     )
     assert done.returncode == 0, done.stderr
     assert "the same as live to the last bit" in done.stdout
-    told = json.loads(figures.read_text())
-    assert told["identical"] is True and Path(told["file"]).is_file()
+    report = json.loads(figures.read_text())
+    assert report["identical"] is True and Path(report["file"]).is_file()
 
 
 @pytest.mark.slow
@@ -372,8 +372,8 @@ def test_the_newer_value_of_a_parameter_stands_though_its_answer_was_written_lat
     with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic(Topic(PARAMETER_EVENTS, kind, [offered(qos.STATE)], "INVALID"), definition(kind))
         for log_time, value in (2, 0.2), (1, 0.1):
-            told = [Parameter("poke_amplitude", value=value).to_parameter_msg()]
-            event = ParameterEvent(node="/calibration", new_parameters=told)
+            changes = [Parameter("poke_amplitude", value=value).to_parameter_msg()]
+            event = ParameterEvent(node="/calibration", new_parameters=changes)
             writer.write(PARAMETER_EVENTS, serialize_message(event), log_time)
         writer.flush()
         bag = BagReader(tmp_path / "bag")
@@ -514,11 +514,11 @@ def test_another_reader_decodes_it_from_the_definitions_in_the_file(
     observer: Observer, domain: int, tmp_path: Path
 ) -> None:
     """And finds each definition to be that of the type by its hash."""
-    told = Calibrate.Impl.FeedbackMessage(feedback=Calibrate.Feedback(label="actuator 3"))
+    message = Calibrate.Impl.FeedbackMessage(feedback=Calibrate.Feedback(label="actuator 3"))
     messages: dict[str, Any] = {
         "/mirror_info": MirrorInfo(serial="of the mirror"),
         "/calibration": Calibration(influence_zernike=[1e-7, 2e-7]),
-        "/calibrate/_action/feedback": told,
+        "/calibrate/_action/feedback": message,
     }
     for name, message in messages.items():
         observer.node.create_publisher(type(message), name, qos.LATCHED).publish(message)
@@ -538,22 +538,22 @@ def test_parameters_of_the_nodes_are_recorded(
     start: Callable[..., Any], observer: Observer, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the time at which the first was asked for: whatever changes meanwhile is newer."""
-    asked: list[int] = []
+    requested: list[int] = []
     get_parameters = AsyncParameterClient.get_parameters
 
     def get(client: AsyncParameterClient, names: list[str]) -> Any:
-        asked.append(time.time_ns())
+        requested.append(time.time_ns())
         return get_parameters(client, names)
 
     monkeypatch.setattr(AsyncParameterClient, "get_parameters", get)
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "store"), "poke_amplitude": 0.31})
     wait_until(lambda: "/calibration/get_parameters" in dict(observer.node.get_service_names_and_types()), 60, "node")
     with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
-        wait_until(lambda: told_by(recorder) == 1, 60, "parameters")
+        wait_until(lambda: nodes_recorded(recorder) == 1, 60, "parameters")
     recorded_events = list(BagReader(tmp_path / "bag").read())
-    assert recorded_events[0].log_time <= asked[0]
-    told = [deserialize_message(each.data, ParameterEvent) for each in recorded_events]
-    values = {each.name: each.value.double_value for event in told for each in event.new_parameters}
+    assert recorded_events[0].log_time <= requested[0]
+    events = [deserialize_message(each.data, ParameterEvent) for each in recorded_events]
+    values = {each.name: each.value.double_value for event in events for each in event.new_parameters}
     assert values["poke_amplitude"] == 0.31 and values.keys() >= {parameter.name for parameter in PARAMETERS}
 
 
@@ -564,11 +564,11 @@ def test_parameters_of_a_node_that_was_started_again_are_recorded_too(
     own = {"calibration_folder": str(tmp_path / "store")}
     node = start("dm_calibration", "calibration", own | {"poke_amplitude": 0.31})
     with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
-        wait_until(lambda: told_by(recorder) == 1, 60, "parameters")
+        wait_until(lambda: nodes_recorded(recorder) == 1, 60, "parameters")
         assert node.stop() == 0
         wait_until(lambda: "calibration" not in observer.node.get_node_names(), 60, "its end")
         start("dm_calibration", "calibration", own | {"poke_amplitude": 0.35})
-        wait_until(lambda: told_by(recorder) == 2, 60, "parameters anew")
+        wait_until(lambda: nodes_recorded(recorder) == 2, 60, "parameters anew")
     values, _remarks = _parameters(BagReader(tmp_path / "bag"), "/calibration", time.time_ns())
     assert values["poke_amplitude"] == 0.35
 

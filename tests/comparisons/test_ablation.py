@@ -72,13 +72,13 @@ def test_many_surfaces_at_once_are_judged_like_one() -> None:
     bench = SimulatedBench(SMALL)
     surface = TrueSurface(bench)
     targets = [FocusTarget(0.01), FocusTarget(-0.03)]
-    stands = []
+    displacements = []
     for signals, target in zip((np.linspace(-0.5, 0.5, 37), np.full(37, 0.3)), targets, strict=True):
         bench.apply(signals)
         bench.settle()
-        stands.append(bench.true_displacement)
+        displacements.append(bench.true_displacement)
         last = true_error(bench, target)
-    errors, rms = surface.errors(np.array(stands), targets)
+    errors, rms = surface.errors(np.array(displacements), targets)
     assert np.abs(errors[-1]).max() == pytest.approx(last.max_zernike, rel=1e-6)
     assert rms[-1] == pytest.approx(last.rms, rel=1e-6)
     limits = fitting_limits(bench, [target.curvature for target in targets])

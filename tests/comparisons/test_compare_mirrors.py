@@ -55,16 +55,16 @@ def test_a_mirror_is_judged_and_its_figures_are_told() -> None:
     assert outcome.groups.keys() == {ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT}
     low, high = outcome.curvatures
     assert low < 0 < high
-    asked = outcome.groups[ANY_ORDER]
-    assert len(asked.error) + len(asked.refusals) == options.requests
-    assert np.all(asked.error < 1e-7)
+    requests = outcome.groups[ANY_ORDER]
+    assert len(requests.error) + len(requests.refusals) == options.requests
+    assert np.all(requests.error < 1e-7)
     row = json.loads(json.dumps(row_of(outcome), allow_nan=False))
     assert row["seed"] == 3
     assert row["mirror"].startswith("preisach, loop 11% ± 15%")
     figures = figures_of([row])
     assert figures["mirrors"] == 1
     assert figures["worst_seed"] == 3
-    assert figures["median_mirror"]["p90_nm"] == pytest.approx(1e9 * asked.quantile(0.9))
+    assert figures["median_mirror"]["p90_nm"] == pytest.approx(1e9 * requests.quantile(0.9))
 
 
 def test_a_mirror_that_cannot_be_driven_fails_by_itself(

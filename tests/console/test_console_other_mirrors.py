@@ -93,8 +93,8 @@ def named_nodes(browser: Browser) -> list[tuple[str, str]]:
     """(role, name) of every control and picture, as Chromium tells them to a screen reader."""
     browser.driver.execute_cdp_cmd("Accessibility.enable", {})
     nodes = browser.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
-    told = [(n.get("role", {}).get("value", ""), n.get("name", {}).get("value", "")) for n in nodes if not n["ignored"]]
-    return [(role, name) for role, name in told if role in CONTROLS]
+    rows = [(n.get("role", {}).get("value", ""), n.get("name", {}).get("value", "")) for n in nodes if not n["ignored"]]
+    return [(role, name) for role, name in rows if role in CONTROLS]
 
 
 def test_without_nodes_the_page_says_what_is_missing(opened: Browser) -> None:
@@ -168,9 +168,9 @@ def test_the_slider_takes_the_mouse(bench: tuple[Browser, StandIn]) -> None:
 def test_every_control_has_a_name(bench: tuple[Browser, StandIn]) -> None:
     for title in DETAILS:
         bench[0].unfold(title)
-    told = named_nodes(bench[0])
-    assert {"button", "spinbutton", "slider", "radio", "switch", "combobox"} <= {role for role, _name in told}
-    assert [role for role, name in told if not name.strip()] == []
+    rows = named_nodes(bench[0])
+    assert {"button", "spinbutton", "slider", "radio", "switch", "combobox"} <= {role for role, _name in rows}
+    assert [role for role, name in rows if not name.strip()] == []
 
 
 def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tuple[Browser, StandIn]) -> None:

@@ -157,10 +157,10 @@ def test_maps_of_another_kind_are_refused(solver: Solver) -> None:
 
 
 def test_the_response_ratio_counts_terms_by_their_rms() -> None:
-    asked = Shape(np.concatenate([np.ones(3), 1e-7 * np.arange(18)]), np.zeros(1))
+    commanded = Shape(np.concatenate([np.ones(3), 1e-7 * np.arange(18)]), np.zeros(1))
     seen = Shape(np.concatenate([np.full(3, 9.0), 0.8e-7 * np.arange(18)]), np.zeros(1))
-    assert response_ratio(asked, seen) == pytest.approx(0.8)
-    tiny = Shape(1e-4 * asked.coefficients[:] * np.concatenate([np.ones(3), np.full(18, 1e-1)]), np.zeros(1))
+    assert response_ratio(commanded, seen) == pytest.approx(0.8)
+    tiny = Shape(1e-4 * commanded.coefficients[:] * np.concatenate([np.ones(3), np.full(18, 1e-1)]), np.zeros(1))
     assert math.isnan(response_ratio(tiny, seen))
 
 

@@ -36,7 +36,7 @@ WAVELENGTH = 632.8e-9
 TRIED_LAWS = ("linear", "Preisach")
 
 
-class Stand:
+class Rig:
     """A calibrated simulation with what its driver has reported since it was switched on."""
 
     def __init__(self) -> None:
@@ -68,19 +68,17 @@ class Stand:
 
 
 @pytest.fixture(scope="module")
-def stand() -> Stand:
-    return Stand()
+def rig() -> Rig:
+    return Rig()
 
 
-def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
+def test_what_was_built_makes_the_shape_again(rig: Rig) -> None:
     steps: list[BuildStep] = []
-    bench = stand.bench
-    builder = RecipeBuilder(
-        stand.loop, bench, lambda: bench.time, BuildOptions(), state=stand.state, on_step=steps.append
-    )
+    bench = rig.bench
+    builder = RecipeBuilder(rig.loop, bench, lambda: bench.time, BuildOptions(), state=rig.state, on_step=steps.append)
     terms = np.zeros((4, len(SPOKEN)))
     terms[3, SPOKEN.index("astigmatism cos")] = 300e-9
-    targets = recipe_targets((0.04, -0.03, 0.0, 0.0), 0.0, terms.ravel().tolist(), stand.loop, 2e-8)
+    targets = recipe_targets((0.04, -0.03, 0.0, 0.0), 0.0, terms.ravel().tolist(), rig.loop, 2e-8)
     astigmatic = targets[2]
     for target in targets:
         builder.build(target)
@@ -91,13 +89,13 @@ def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
     assert recipes[0].maps <= 16
     assert all(recipe.maps <= 8 for recipe in (recipes[1], recipes[3]))
     assert sum(recipe.maps for recipe in recipes) == builder.maps == len(steps)
-    book = recipe_book(recipes, stand.loop, bench.config.degauss_steps, 1)
-    corrections = Corrections(book, stand.loop)
+    book = recipe_book(recipes, rig.loop, bench.config.degauss_steps, 1)
+    corrections = Corrections(book, rig.loop)
     errors, state = [], builder.state
     targets = [FocusTarget(0.04), astigmatic, FocusTarget(-0.03), FocusTarget(0.0), astigmatic, FocusTarget(0.04)]
     for target, waited in zip(targets, (0.0, 20.0, 200.0, 50.0, 0.0, 5.0), strict=True):
         bench.time += waited  # creep that the next degauss does not wipe
-        error, state = stand.replay(target, corrections.find(target).effective, state)
+        error, state = rig.replay(target, corrections.find(target).effective, state)
         errors.append(error)
     assert np.median(errors) < WAVELENGTH / 1000.0
     assert max(errors) < WAVELENGTH / 400.0
@@ -227,9 +225,9 @@ def test_bad_shapes_are_refused_before_anything_moves(
         recipe_targets(curvatures, 0.0, zernike, LOOP, 2e-8)
 
 
-def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
+def test_a_shape_that_only_the_law_denies_is_told(rig: Rig) -> None:
     """The influence function allows effective signals that the conditioned mirror, at its limits, does not reach."""
-    weaker = Planner(LOOP.mirror, stand.loop.hysteresis)
+    weaker = Planner(LOOP.mirror, rig.loop.hysteresis)
     assert weaker.hysteresis is not None
     weaker.law = replace(weaker.hysteresis.law.scaled(0.05), creep_rate=0.0)
     plant = LinearPlant(GAINS)

@@ -157,5 +157,5 @@ def test_what_is_left_is_inside_the_absolute_bound(seed: int, tmp_path: Path) ->
     repeatable = 2.0 * corrected.std(axis=0, ddof=1).max() / np.sqrt(AVERAGED)
     calibration = SimpleNamespace(wavelength=632.8e-9, aperture_radius=SETTINGS.aperture_radius, **bounds)
     text = accuracy_text(float(repeatable), calibration, 2.0 * power / RADIUS**2)
-    told = re.search(r"absolute to ([\d.]+) nm", text)
-    assert told and left < 1e-9 * float(told[1]) < before > 4.0 * left, (left, before, text)
+    absolute = re.search(r"absolute to ([\d.]+) nm", text)
+    assert absolute and left < 1e-9 * float(absolute[1]) < before > 4.0 * left, (left, before, text)

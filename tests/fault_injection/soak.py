@@ -131,9 +131,9 @@ class _Client(Node):
         self.answered += 1
         # A request that a newer one replaced before the driver confirmed it is not refused: the latest wins.
         self.refused += state.error_code not in (ErrorCode.OK, ErrorCode.PREEMPTED)
-        came = self._commands.pop((state.header.stamp.sec, state.header.stamp.nanosec), None)
-        if came is not None:
-            self.window.latency_us.append(1e-3 * (came - sent))
+        arrived = self._commands.pop((state.header.stamp.sec, state.header.stamp.nanosec), None)
+        if arrived is not None:
+            self.window.latency_us.append(1e-3 * (arrived - sent))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -149,18 +149,18 @@ def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.Mo
     run, check = relay_run(0.2, 14, 120)
     assert run.in_use == run.reach
     run = replace(run, limits=(-1.5, 0.1))
-    asked, falls = list[HysteresisModel](), 0
+    checked, falls = list[HysteresisModel](), 0
 
     def slope(law: HysteresisModel, low: float, high: float) -> Floats:
         assert (low, high) == (-1.5, run.reach[1])
-        asked.append(law)
-        return np.full(1, -1.0 if len(asked) == falls else 1.0)
+        checked.append(law)
+        return np.full(1, -1.0 if len(checked) == falls else 1.0)
 
     monkeypatch.setattr(law_shape, "slope_min", slope)
-    assert identify(run, check, COMMON).fit.law is asked[-1]  # of all maps
-    falls, asked = len(asked), []
+    assert identify(run, check, COMMON).fit.law is checked[-1]  # of all maps
+    falls, checked = len(checked), []
     found = identify(run, check, COMMON)
-    assert len(asked) == falls and any(found.fit.law is law for law in asked[:-1])
+    assert len(checked) == falls and any(found.fit.law is law for law in checked[:-1])
     np.testing.assert_array_equal(found.held_out[check], found.fit.residual[check])  # of the law that is taken
     assert found.refused == {
         "the fit that includes the test moves": "its slope falls to -1.00: it could not be inverted safely"

@@ -299,8 +299,8 @@ def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
     for bad in (1, 2, 3):
         suite.shape()
         suite.bench.publish_map(suite.bench.map(bump=100e-9))
-        told = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
-        wait_until(told, 60)
+        warned = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
+        wait_until(warned, 60)
         wait_until(lambda: not books[-1].recipes, 60, "recipes of the mirror as it was to be withdrawn")
         assert books[-1].degauss_steps == 100, "there are some"
     assert quality == Capabilities.CALIBRATED

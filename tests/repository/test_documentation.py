@@ -27,7 +27,7 @@ import pytest
 import typer
 import yaml
 
-import documentation as told
+import documentation as docs
 from dm_bringup.nodes import LAUNCH_ARGUMENTS
 from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
@@ -42,7 +42,7 @@ from support import wait_until
 
 pytestmark = pytest.mark.processes
 
-ROOT = told.ROOT
+ROOT = docs.ROOT
 BLOCKS = blocks()
 SHELL = [(str(block), command) for block in BLOCKS if block.kind == "shell" for command in block.commands]
 ROS = sorted({command for _, command in SHELL if command.startswith("ros2 ")})
@@ -65,15 +65,15 @@ def numbered(kind: str) -> dict[tuple[str, int], Block]:
 
 @pytest.mark.parametrize(("where", "command"), SHELL)
 def test_every_command_is_classified(where: str, command: str) -> None:
-    assert told.classified(command), f"{where}: say in tests/documentation.py how {command!r} is to be tried"
+    assert docs.classified(command), f"{where}: say in tests/documentation.py how {command!r} is to be tried"
 
 
 def test_nothing_is_classified_that_the_documentation_does_not_say() -> None:
     said = {command for _, command in SHELL}
-    known = {*told.RUN, *told.WATCHED, told.SCENE, *told.REPLAYED, *told.PARSED, *told.ELSEWHERE}
+    known = {*docs.RUN, *docs.WATCHED, docs.SCENE, *docs.REPLAYED, *docs.PARSED, *docs.ELSEWHERE}
     assert known <= said
-    assert {*told.PRELUDES, *told.PYTHON_ELSEWHERE} == numbered("python").keys()
-    assert told.TEXTS.keys() == {block.text.split("\n", 1)[0] for block in BLOCKS if block.kind == "text"}
+    assert {*docs.PRELUDES, *docs.PYTHON_ELSEWHERE} == numbered("python").keys()
+    assert docs.TEXTS.keys() == {block.text.split("\n", 1)[0] for block in BLOCKS if block.kind == "text"}
 
 
 def test_references_are_those_that_the_code_cites() -> None:
@@ -94,7 +94,7 @@ def test_each_package_says_what_it_holds(package: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", [*told.PAGES, *(ROOT / "src").glob("*/README.md")], ids=lambda path: f"{path.parent.name}/{path.name}"
+    "page", [*docs.PAGES, *(ROOT / "src").glob("*/README.md")], ids=lambda path: f"{path.parent.name}/{path.name}"
 )
 def test_modules_and_files_that_are_named_exist(page: Path) -> None:
     text = page.read_text()
@@ -150,7 +150,7 @@ def test_options_exist(command: str) -> None:
     check_dm(command)
 
 
-@pytest.mark.parametrize(("page", "command"), sorted(set(told.inline_commands())))
+@pytest.mark.parametrize(("page", "command"), sorted(set(docs.inline_commands())))
 def test_options_exist_within_the_text(page: str, command: str) -> None:
     """Placeholders are replaced; a command that is only named need not be whole."""
     for word, instead in (("…", "x.yaml"), ("FILE", "x.yaml"), ("LAW", "preisach"), ("METRES", "-1.5")):
@@ -298,7 +298,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         log = folder / "up.log"
         with log.open("wb") as output:
             up = subprocess.Popen(
-                shlex.split(told.SCENE), cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
+                shlex.split(docs.SCENE), cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
             )
         try:
             with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
@@ -317,7 +317,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         assert status == 0, log.read_text(errors="replace")
 
 
-@pytest.mark.parametrize("command", told.RUN)
+@pytest.mark.parametrize("command", docs.RUN)
 def test_it_runs(scene: Scene, command: str) -> None:
     said = scene.run(shlex.split(command))
     assert said.strip()
@@ -334,8 +334,8 @@ def test_the_first_hour_is_run_as_written() -> None:
     """The commands of the newcomer's page, in their order, are those that run here."""
     page = [command for where, command in SHELL if where.startswith("first-run.md") and command.startswith("./dm ")]
     start = page.index("./dm up --camera")
-    hour = [command for command in page[start + 1 : page.index("./dm degauss") + 1] if command not in told.PARSED]
-    assert [command for command in told.RUN if command in hour] == hour
+    hour = [command for command in page[start + 1 : page.index("./dm degauss") + 1] if command not in docs.PARSED]
+    assert [command for command in docs.RUN if command in hour] == hour
 
 
 def test_the_first_hour_warns_of_nothing(scene: Scene) -> None:
@@ -348,12 +348,12 @@ def test_the_glossary_has_the_words_of_the_first_hour(scene: Scene) -> None:
     log = re.sub(r"(?m)^\S+ \S+ (?=INFO)", "", (scene.folder / "up.log").read_text(errors="replace"))
     assert scene.said
     # Whatever is found is a plain word, or one for the glossary.
-    assert sorted(told.unexplained("\n".join([log, *scene.said]))) == []
+    assert sorted(docs.unexplained("\n".join([log, *scene.said]))) == []
 
 
-@pytest.mark.parametrize("place", sorted(told.PRELUDES), ids=str)
+@pytest.mark.parametrize("place", sorted(docs.PRELUDES), ids=str)
 def test_python_runs(scene: Scene, place: tuple[str, int]) -> None:
-    program = told.PRELUDES[place] + numbered("python")[place].text
+    program = docs.PRELUDES[place] + numbered("python")[place].text
     scene.run([sys.executable, "-c", program])
 
 
@@ -370,21 +370,21 @@ def test_calls_that_the_bench_answers(scene: Scene, command: str) -> None:
         assert answer.result().error_code == 0, answer.result().message
 
 
-WITH_OWN_DOMAIN = [command for command in told.WATCHED if command.startswith("./dm up")]
+WITH_OWN_DOMAIN = [command for command in docs.WATCHED if command.startswith("./dm up")]
 
 
-@pytest.mark.parametrize("command", [c for c in told.WATCHED if c not in WITH_OWN_DOMAIN])
+@pytest.mark.parametrize("command", [c for c in docs.WATCHED if c not in WITH_OWN_DOMAIN])
 def test_it_starts_and_ends_on_ctrl_c(scene: Scene, command: str) -> None:
     if command.startswith("./dm console"):
-        _skip_without_port(int(told.WATCHED[command].rsplit(":", 1)[1]))
-    scene.watch(command, told.WATCHED[command])
+        _skip_without_port(int(docs.WATCHED[command].rsplit(":", 1)[1]))
+    scene.watch(command, docs.WATCHED[command])
 
 
 @pytest.mark.parametrize("command", WITH_OWN_DOMAIN)
 def test_the_shipped_bench_starts_and_ends_on_ctrl_c(scene: Scene, command: str) -> None:
     _skip_without_port(12340, 12341, 12342, 12343)
     with own_domain() as domain:
-        scene.watch(command, told.WATCHED[command], domain)
+        scene.watch(command, docs.WATCHED[command], domain)
 
 
 def _skip_without_port(*ports: int) -> None:
@@ -398,7 +398,7 @@ def _skip_without_port(*ports: int) -> None:
                 pytest.skip(f"port {port} is in use on this machine")
 
 
-@pytest.mark.parametrize("command", told.REPLAYED)
+@pytest.mark.parametrize("command", docs.REPLAYED)
 def test_a_recording_is_played_back(scene: Scene, command: str) -> None:
     with own_domain() as domain:
         if not (scene.folder / "runs" / "monday").exists():

@@ -208,14 +208,14 @@ def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [0.25, 0.5, 1.0])
-def test_optics_that_contradict_the_images_are_named_with_what_would_fit(told: float) -> None:
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
+def test_optics_that_contradict_the_images_are_named_with_what_would_fit(share: float) -> None:
     """Who gives half the focal length hears that twice as much would fit; who gives the right one hears nothing."""
-    lens = replace(LENS, focal_length_px=told * LENS.focal_length_px)
+    lens = replace(LENS, focal_length_px=share * LENS.focal_length_px)
     search = FocusSearch(CONFIG, DefocusModel((SIDE, SIDE), lens, HIGH - LOW + 10 * DEPTH), 0.0)
     run(search, DefocusedCamera(clouds(), 0.0123))
     assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.0123, abs=DEPTH)
-    assert search.fitting_scale() == pytest.approx(1 / told)
+    assert search.fitting_scale() == pytest.approx(1 / share)
     assert FocusSearch(CONFIG, "not known", 0.0).fitting_scale() == 1
 
 

@@ -80,11 +80,11 @@ class Play:
     """Backlash of a given width: where a mirror without a model of its hysteresis really stands."""
 
     def __init__(self, width: float) -> None:
-        self.half, self.stands = width / 2, 0.0
+        self.half, self.position = width / 2, 0.0
 
     def go(self, wanted: float) -> float:
-        self.stands = min(max(self.stands, wanted - self.half), wanted + self.half)
-        return self.stands
+        self.position = min(max(self.position, wanted - self.half), wanted + self.half)
+        return self.position
 
 
 @given(top=st.floats(LOW + 0.01, HIGH - 0.02), width=st.floats(0.0, 0.01))
@@ -92,8 +92,8 @@ def test_hysteresis_does_not_lead_astray(top: float, width: float) -> None:
     """The sharpest place is taken, wherever its curvature is believed to be."""
     play, search = Play(width), PeakSearch(CONFIG)
     while not search.done:
-        stands = play.go(search.step.curvature)
-        search.feed(hill(stands, top, 0.005) if search.step.measured else None)
+        position = play.go(search.step.curvature)
+        search.feed(hill(position, top, 0.005) if search.step.measured else None)
     assert play.go(search.step.curvature) == pytest.approx(top, abs=TOLERANCE)
 
 

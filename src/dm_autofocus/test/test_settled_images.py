@@ -50,13 +50,13 @@ def test_every_row_of_an_image_that_counts_shows_the_focus_that_was_asked_for(ca
         arrivals.append((end + delay, begin, end))
     counted = 0
     for arrived, begin, end in sorted(arrivals):
-        stands = commands[-1] + MOVE
-        if arrived >= stands:
-            gate.written(stands, moving=False, reached=True)
+        arrival = commands[-1] + MOVE
+        if arrived >= arrival:
+            gate.written(arrival, moving=False, reached=True)
         if not gate.open_for(begin + camera.stamp_lead):
             continue
         counted += 1
-        assert begin >= stands + SETTLE, "the first row"
+        assert begin >= arrival + SETTLE, "the first row"
         assert end <= arrived, "the last row was read before the next move began"
         commands.append(arrived)
         gate = SettledGate(SETTLE, camera.stamp_lead)

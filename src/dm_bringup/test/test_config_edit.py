@@ -46,8 +46,8 @@ def test_comments_and_all_other_lines_stay() -> None:
     ids=["new section", "on lines", "in braces"],
 )
 def test_new_parameters_come_first_in_the_order_in_which_they_are_told(text: str) -> None:
-    told = {"z": 1.0, "b": 2.0, "m": [3, 4]}
-    assert list(values(edited(text, {"pdm_driver": told}))["pdm_driver"]) == [*told, *(["a"] if text else [])]
+    added = {"z": 1.0, "b": 2.0, "m": [3, 4]}
+    assert list(values(edited(text, {"pdm_driver": added}))["pdm_driver"]) == [*added, *(["a"] if text else [])]
 
 
 @pytest.mark.parametrize(

@@ -156,18 +156,18 @@ def test_a_general_section_that_would_overrule_a_particular_one_is_refused(tmp_p
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:
     """What is said until so many restarts, and the pauses before them, s."""
-    told: list[str] = []
+    said: list[str] = []
     times: list[float] = []
 
     def say(text: str) -> None:
-        told.append(text)
+        said.append(text)
         times.append(time.monotonic())
 
     deadline = time.monotonic() + 30.0
-    while len(told) < 2 * count and time.monotonic() < deadline:
+    while len(said) < 2 * count and time.monotonic() < deadline:
         suite.revive(say)
         time.sleep(0.01)
-    return told, [times[2 * k + 1] - times[2 * k] for k in range(count)]
+    return said, [times[2 * k + 1] - times[2 * k] for k in range(count)]
 
 
 def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..., Suite], tmp_path: Path) -> None:
@@ -179,8 +179,8 @@ def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..
         deadline = time.monotonic() + 30.0
         while not suite.log("calibration").read_text() and time.monotonic() < deadline:
             time.sleep(0.01)
-        told = suite.log("calibration").read_text()
-    assert "'-r', 'image_raw:=/camera/image_raw', '-r', '__ns:=/left'" in told
+        said = suite.log("calibration").read_text()
+    assert "'-r', 'image_raw:=/camera/image_raw', '-r', '__ns:=/left'" in said
     assert mine.read_text() == "# logs are to lie beside it\n"
     with pytest.raises(ValueError, match="remap: 'image_raw': must be of the form from:=to"):
         run(code, remap=["image_raw"])
@@ -189,9 +189,9 @@ def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..
 @pytest.mark.slow
 def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[..., Suite]) -> None:
     with run("import os; os.kill(os.getpid(), 9)") as suite:
-        told, pauses = revived(suite, 2)
-    assert told[0] == f"the node calibration was killed by signal 9; it is started again in {RESTART_S:g} s"
-    assert told[1] == "the node calibration is started again" and told[2].endswith(f"in {2 * RESTART_S:g} s")
+        said, pauses = revived(suite, 2)
+    assert said[0] == f"the node calibration was killed by signal 9; it is started again in {RESTART_S:g} s"
+    assert said[1] == "the node calibration is started again" and said[2].endswith(f"in {2 * RESTART_S:g} s")
     assert pauses[0] >= RESTART_S and pauses[1] >= 2 * RESTART_S
 
 

@@ -192,14 +192,14 @@ def test_a_report_counts_as_heard_once_it_is_followed(
     history: AppliedHistory, driver: Driver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who waits for it, in another thread, asks for the state at once."""
-    track, asked = history._track, list[Future[bool]]()
+    track, waiting = history._track, list[Future[bool]]()
 
     def tracked(report: Applied) -> None:
-        asked.append(pool.submit(history.heard_since, 10.0))
-        assert not wait(asked, 0.05).done
+        waiting.append(pool.submit(history.heard_since, 10.0))
+        assert not wait(waiting, 0.05).done
         track(report)
 
     with ThreadPoolExecutor() as pool:
         monkeypatch.setattr(history, "_track", tracked)
         driver.go(10.0, 0.2)
-        assert asked[0].result()
+        assert waiting[0].result()

@@ -193,7 +193,7 @@ def test_arrays_of_commands_times_and_maps(
     effective, _ = follow(law, law.demagnetised(mirror.actuators, 0.0), moves.signals, times, moved)
     sag = seen(plant, inside, effective)
     sag[[0, 7]] = np.nan  # their commands count all the same
-    told: dict[str, Any] = {"moved": moved} if pause else {}
+    times_of_moves: dict[str, Any] = {"moved": moved} if pause else {}
     file = tmp_path / "run.npz"
     np.savez(
         file,
@@ -204,7 +204,7 @@ def test_arrays_of_commands_times_and_maps(
         commands=moves.signals,
         times=times,
         sag=sag,
-        **told,
+        **times_of_moves,
     )
     # Its actuators are alike; laws of each by itself would take most of the time.
     monkeypatch.setattr(calibrator, "fit_hysteresis", partial(fit_hysteresis, candidates=COMMON))
@@ -289,9 +289,9 @@ def test_an_empty_folder_is_named(tmp_path: Path) -> None:
         calibrate(tmp_path, np.zeros((1, 7)), mirror=make_mirror(rings=1))
 
 
-@pytest.mark.parametrize("told", [np.inf, np.nan, 1e15, 2e10, -5.0])
+@pytest.mark.parametrize("stamp", [np.inf, np.nan, 1e15, 2e10, -5.0])
 def test_a_time_in_a_file_that_can_be_none_is_not_known(
-    told: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stamp: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mirror = make_mirror(rings=1)
     plant, inside = plant_on_pixels(mirror)
@@ -302,7 +302,7 @@ def test_a_time_in_a_file_that_can_be_none_is_not_known(
 
     def damaged(ingest: Ingest, *arguments: Any) -> Any:
         surface, measured = read(ingest, *arguments)
-        return replace(surface, time_stamp=told), measured
+        return replace(surface, time_stamp=stamp), measured
 
     monkeypatch.setattr(Ingest, "read", damaged)
     outcome = outcome_of(tmp_path, commands, None, mirror)

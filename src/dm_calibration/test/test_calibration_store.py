@@ -351,6 +351,6 @@ def test_a_bound_that_is_no_number_is_no_calibration_and_grades_are_known(
 
 def test_a_refit_has_the_poke_check_of_its_own_fit(calibration: Calibration) -> None:
     found = "Poke check: actuator 1 shows no response above the noise."
-    told = replace(calibration, limitations=(*calibration.limitations, found))
-    again = refit(told, FitOptions(), (), Provenance("again", 2))
+    limited = replace(calibration, limitations=(*calibration.limitations, found))
+    again = refit(limited, FitOptions(), (), Provenance("again", 2))
     assert found not in again.limitations and again.limitations[-1].startswith("Fitted again")

@@ -390,15 +390,15 @@ def test_nothing_is_used_before_a_second_shape_has_borne_it_out(
 def test_a_bad_map_widens_the_bound_at_once_and_a_good_one_restores_it(
     bench: SteadyMirror, made: Made, tmp_path: Path
 ) -> None:
-    told = {}
+    promises = {}
     for name, bump in (("first", 0.0), ("bad", 40e-9), ("good", 0.0)):
         begun(made, tmp_path).take(bench.measure(name, bump=bump), bench.settled())
         updates = begun(made, tmp_path)  # also across a restart
         message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
         put_updates(message, in_use(updates), np.nan, [], False)
-        told[name] = message.held_out_max_zernike
-    assert told["bad"] > 20e-9
-    assert told["good"] == told["first"] < 5e-9
+        promises[name] = message.held_out_max_zernike
+    assert promises["bad"] > 20e-9
+    assert promises["good"] == promises["first"] < 5e-9
 
 
 def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: RecalibrationManager) -> None:

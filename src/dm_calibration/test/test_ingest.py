@@ -123,13 +123,13 @@ def test_a_reference_that_does_not_tell_its_wavelength_is_believed_as_maps_are(s
 
 def test_a_sphere_of_known_radius_gives_the_lateral_scale(surface: Path) -> None:
     """A file that is 0.3 % wrong about its pixels makes 9 nm of defocus at 0.05 1/m: none with the pitch found."""
-    told, true = read_map(surface), 1.003 * PITCH
+    nominal, true = read_map(surface), 1.003 * PITCH
     rows, columns = np.mgrid[:SIZE, :SIZE]
     away = true * np.hypot(columns - 62, 57 - rows)
 
     def seen(curvature: float, settings: IngestSettings) -> Measurement:
-        sag = np.where(told.valid, conic_sag(away, np.zeros_like(away), curvature), np.nan)
-        return Ingest().measure(dataclasses.replace(told, sag=sag), settings)[1]
+        sag = np.where(nominal.valid, conic_sag(away, np.zeros_like(away), curvature), np.nan)
+        return Ingest().measure(dataclasses.replace(nominal, sag=sag), settings)[1]
 
     sphere = seen(-1 / 1.5, IngestSettings())
     pitch, share = pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, -1.5)

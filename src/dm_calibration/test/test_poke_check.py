@@ -44,7 +44,7 @@ def test_a_sensor_that_sees_the_terms_alone_finds_nothing_else(length: float) ->
     order = np.arange(37)
     order[[2, 6]] = order[[6, 2]]
     terms, root = PLANT.modes, np.sqrt(PLANT.points.weight)[:, None]
-    seen = terms @ np.linalg.lstsq(root * terms, root * response(*stand(-0.82), length), rcond=None)[0]
+    seen = terms @ np.linalg.lstsq(root * terms, root * response(*seen_positions(-0.82), length), rcond=None)[0]
     result = check(seen[:, order])
     assert result.registration is not None and result.registration.turn == pytest.approx(-0.82, abs=0.01)
     assert len(result.findings) == 2 and result.findings[-1] == "actuators 3 and 7 are exchanged"
@@ -86,7 +86,7 @@ def test_any_wiring_is_found(order: list[int], seed: int) -> None:
     assert result.passed == (order == sorted(order))
 
 
-def stand(
+def seen_positions(
     turn: float, mirrored: bool = False, shift: complex = 0.0, scale: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the actuators are seen, m."""
@@ -104,7 +104,7 @@ def same_turn(found: float, turn: float) -> float:
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_a_turned_mirror_is_one_finding(degrees: float, mirrored: bool) -> None:
     """Not thirty exchanged actuators, also where the numbering could as well begin elsewhere."""
-    result = check(response(*stand(np.radians(degrees), mirrored)))
+    result = check(response(*seen_positions(np.radians(degrees), mirrored)))
     assert len(result.findings) == 1 and result.turned
     assert result.registration is not None
     assert np.angle(np.exp(1j * (result.registration.turn - np.radians(degrees)))) == pytest.approx(0.0, abs=0.005)
@@ -113,7 +113,7 @@ def test_a_turned_mirror_is_one_finding(degrees: float, mirrored: bool) -> None:
 
 
 def test_the_sentence_gives_turn_image_shift_and_their_errors() -> None:
-    findings = check(response(*stand(np.radians(35.0), True, 1.2e-3 - 0.5e-3j))).findings
+    findings = check(response(*seen_positions(np.radians(35.0), True, 1.2e-3 - 0.5e-3j))).findings
     assert len(findings) == 1
     pattern = (
         r"the maps show the mirror mirrored left to right, then turned by (35\.0|34\.9)\d \+- 0\.\d\d degrees "
@@ -136,11 +136,13 @@ def test_any_mounting_with_any_numbering(
     rings = np.split(np.arange(37), [1, 7, 19])
     begun = np.concatenate([np.roll(ring, random.integers(ring.size)) for ring in rings])
     order = begun if by_rings else random.permutation(37)
-    x, y = stand(turn, mirrored, complex(*shift), scale)
+    x, y = seen_positions(turn, mirrored, complex(*shift), scale)
     result = check(response(x[order], y[order], seed=seed))
-    stands = result.registration
-    assert stands is not None
-    found_x, found_y = stand(stands.turn, stands.mirrored, complex(*stands.shift), stands.scale)
+    registration = result.registration
+    assert registration is not None
+    found_x, found_y = seen_positions(
+        registration.turn, registration.mirrored, complex(*registration.shift), registration.scale
+    )
     apart = np.hypot(found_x[result.place] - x[order], found_y[result.place] - y[order])
     assert apart.max() < 1e-4, result.pose
 
@@ -161,7 +163,7 @@ def test_any_mounting_with_any_faults(
 ) -> None:
     random = np.random.default_rng(seed)
     shift_m = complex(*shift)
-    measured = response(*stand(turn, mirrored, shift_m, scale), seed=seed)
+    measured = response(*seen_positions(turn, mirrored, shift_m, scale), seed=seed)
     left, place = list(random.permutation(37)), np.arange(37)
     expected: list[str] = []
     weak: list[int] = []
@@ -187,10 +189,10 @@ def test_any_mounting_with_any_faults(
             place[[one, other]] = other, one
             expected.append(f"actuators {numbers[0]} and {numbers[1]} are exchanged")
     result = check(measured, silent=silent)
-    stands = result.registration
-    assert stands is not None and stands.mirrored == mirrored
-    turned, moved = np.angle(np.exp(1j * (stands.turn - turn))), abs(complex(*stands.shift) - shift_m)
-    assert abs(turned) < 0.01 and moved < 1e-4 and abs(stands.scale - scale) < 0.01, result.pose
+    registration = result.registration
+    assert registration is not None and registration.mirrored == mirrored
+    turned, moved = np.angle(np.exp(1j * (registration.turn - turn))), abs(complex(*registration.shift) - shift_m)
+    assert abs(turned) < 0.01 and moved < 1e-4 and abs(registration.scale - scale) < 0.01, result.pose
     assert result.place.tolist() == place.tolist()
     text = "; ".join(result.findings)
     assert all(words in text for words in expected), text
@@ -226,7 +228,7 @@ def test_an_arrangement_without_symmetry() -> None:
 
 @pytest.mark.parametrize("scale", [0.85, 1.1])
 def test_a_scale_that_contradicts_the_pitch(scale: float) -> None:
-    findings = check(response(*stand(0.0, scale=scale))).findings
+    findings = check(response(*seen_positions(0.0, scale=scale))).findings
     assert len(findings) == 1
     seen = re.search(r"actuators (\S+) \+- 0\.0\d mm apart, configured are 4\.30 mm: correct the lateral", findings[0])
     assert seen and float(seen[1]) == pytest.approx(4.3 * scale, rel=0.015)
@@ -243,7 +245,7 @@ def test_pokes_too_small_to_see() -> None:
 
 def test_maps_that_show_something_else() -> None:
     """A third of the pupil stretched over the aperture: the places seen are not those of the mirror."""
-    measured = response(*stand(0.0, shift=2.2e-2 + 0j, scale=3.0))
+    measured = response(*seen_positions(0.0, shift=2.2e-2 + 0j, scale=3.0))
     findings = check(measured).findings
     assert any("do not fit the configured positions" in finding for finding in findings), findings
 
@@ -296,7 +298,7 @@ def test_dead_actuator_and_exchanged_pair() -> None:
 
 def test_actuators_beside_a_displaced_aperture_are_not_called_dead() -> None:
     silent = np.arange(37) == 22
-    quiet, pose = check(response(*stand(0.0, False, 1.2e-3 - 0.5e-3j)), silent=silent).findings
+    quiet, pose = check(response(*seen_positions(0.0, False, 1.2e-3 - 0.5e-3j)), silent=silent).findings
     assert (
         quiet
         == "actuator 23 shows no response above the noise in the maps as they are now: check again once they "

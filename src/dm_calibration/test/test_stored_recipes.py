@@ -34,7 +34,7 @@ def calibration() -> Calibration:
     return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("known", 10**18))
 
 
-class Stand:
+class Rig:
     """A manager with one stored calibration in use."""
 
     def __init__(self, folder: Path, calibration: Calibration) -> None:
@@ -50,8 +50,8 @@ class Stand:
 
 
 @pytest.fixture
-def stand(tmp_path: Path, calibration: Calibration) -> Stand:
-    return Stand(tmp_path, calibration)
+def rig(tmp_path: Path, calibration: Calibration) -> Rig:
+    return Rig(tmp_path, calibration)
 
 
 def book(*curvatures: float, actuators: int = ACTUATORS, steps: int = 100, maps: int = 20) -> RecipeBook:
@@ -71,21 +71,21 @@ def raw_data(file: Path) -> dict[str, bytes]:
     return {name: value.tobytes() if value.dtype != object else b"|".join(value) for name, value in found.items()}
 
 
-def test_the_next_start_uses_what_was_in_use_last(stand: Stand, calibration: Calibration) -> None:
+def test_the_next_start_uses_what_was_in_use_last(rig: Rig, calibration: Calibration) -> None:
     """Not one that was stored later without being used; the newest where the last is gone, which is said."""
-    newer = stand.store.save(replace(calibration, id="newer", created_ns=calibration.created_ns + 1))
-    used, reason = stand.manager.load_last()
+    newer = rig.store.save(replace(calibration, id="newer", created_ns=calibration.created_ns + 1))
+    used, reason = rig.manager.load_last()
     assert (used.id, reason) == ("known", "")
     stand.file.unlink()
     used, reason = stand.manager.load_last()
     assert used.id == "newer" == stand.store.last_in_use(calibration.mirror_serial)
     assert reason.startswith("the calibration last in use, known, cannot be loaded: calibration 'known': no such file")
     for content in (b"newer\n", b"~nobody", b"../newer", b"\xff"):
-        (stand.store.folder / "in_use_T-1.txt").write_bytes(content)
-        assert stand.manager.load_last()[0].id == "newer"
+        (rig.store.folder / "in_use_T-1.txt").write_bytes(content)
+        assert rig.manager.load_last()[0].id == "newer"
     newer.unlink()
     with pytest.raises(Refusal, match="no calibration in"):
-        stand.manager.load_last()
+        rig.manager.load_last()
 
 
 def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calibration) -> None:
@@ -96,34 +96,34 @@ def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calib
     assert "could not be noted for the next start: " in stand.manager.load("known")[1]
 
 
-def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
-    before = raw_data(stand.file)
-    stand.manager.add_recipes("known", book(-0.01, 0.02))
-    stand.manager.add_recipes("known", book(0.0, 0.02, maps=33))
-    loaded = stand.store.load("known")
+def test_recipes_join_the_calibration_and_its_file(rig: Rig) -> None:
+    before = raw_data(rig.file)
+    rig.manager.add_recipes("known", book(-0.01, 0.02))
+    rig.manager.add_recipes("known", book(0.0, 0.02, maps=33))
+    loaded = rig.store.load("known")
     assert [(r.curvature, r.maps) for r in loaded.recipes.recipes] == [(-0.01, 20), (0.0, 33), (0.02, 33)]
     assert len(before) > 10
-    assert raw_data(stand.file) == before
-    assert sorted(file.name for file in stand.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
-    assert stand.published[-1] is stand.manager.in_use
-    assert stand.published[-1] is not None
-    assert len(stand.published[-1].recipes.recipes) == 3
+    assert raw_data(rig.file) == before
+    assert sorted(file.name for file in rig.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
+    assert rig.published[-1] is rig.manager.in_use
+    assert rig.published[-1] is not None
+    assert len(rig.published[-1].recipes.recipes) == 3
 
 
-def test_what_comes_after_a_cleanup_is_not_used(stand: Stand) -> None:
-    stand.resting = "calibration is not active"
-    stand.manager.use(None)
+def test_what_comes_after_a_cleanup_is_not_used(rig: Rig) -> None:
+    rig.resting = "calibration is not active"
+    rig.manager.use(None)
     with pytest.raises(Refusal, match="known is stored, but not used: calibration is not active") as caught:
-        stand.manager.load("known")
+        rig.manager.load("known")
     assert caught.value.error_code == ErrorCode.NODE_INACTIVE
-    assert stand.manager.in_use is None and stand.published[-1] is None
+    assert rig.manager.in_use is None and rig.published[-1] is None
 
 
-def test_one_that_promises_clearly_less_is_used_with_a_warning(stand: Stand, calibration: Calibration) -> None:
+def test_one_that_promises_clearly_less_is_used_with_a_warning(rig: Rig, calibration: Calibration) -> None:
     def promising(share: float) -> Calibration:
         fit = replace(calibration.fit, held_out_max_zernike=share * calibration.promise)
         made = replace(calibration, id=f"of_{share:g}", fit=fit)
-        stand.store.save(made)
+        rig.store.save(made)
         return made
 
     assert stand.manager.use(promising(1.9)) == ""
@@ -135,22 +135,22 @@ def test_one_that_promises_clearly_less_is_used_with_a_warning(stand: Stand, cal
     assert stand.manager.use(calibration) == ""
 
 
-def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, published = stand.file.read_bytes(), len(stand.published)
+def test_a_write_that_fails_leaves_everything_as_it_was(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, published = rig.file.read_bytes(), len(rig.published)
 
     def full(*_arguments: object) -> int:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match=r"known was not stored in .*: No space left on device") as caught:
-        stand.manager.add_recipes("known", book(0.01))
+        rig.manager.add_recipes("known", book(0.01))
     monkeypatch.undo()
     assert error_code(caught.value) == ErrorCode.STORAGE_FAILED
-    assert stand.file.read_bytes() == before
-    assert sorted(file.name for file in stand.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
-    assert stand.manager.in_use is not None
-    assert stand.manager.in_use.recipes is NO_RECIPES
-    assert len(stand.published) == published
+    assert rig.file.read_bytes() == before
+    assert sorted(file.name for file in rig.file.parent.iterdir()) == ["in_use_T-1.txt", "known.h5"]
+    assert rig.manager.in_use is not None
+    assert rig.manager.in_use.recipes is NO_RECIPES
+    assert len(rig.published) == published
 
 
 @pytest.mark.parametrize(
@@ -168,28 +168,28 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
     ],
 )
 def test_recipes_that_do_not_belong_are_refused(
-    stand: Stand, calibration_id: str, recipes: Callable[[], RecipeBook], code: int, words: str
+    rig: Rig, calibration_id: str, recipes: Callable[[], RecipeBook], code: int, words: str
 ) -> None:
-    stand.manager.add_recipes("known", book(0.01))
-    before = stand.file.read_bytes()
+    rig.manager.add_recipes("known", book(0.01))
+    before = rig.file.read_bytes()
     with pytest.raises((Refusal, RecipeError), match=words) as caught:
-        stand.manager.add_recipes(calibration_id, recipes())
+        rig.manager.add_recipes(calibration_id, recipes())
     assert error_code(caught.value) == code
-    assert stand.file.read_bytes() == before
+    assert rig.file.read_bytes() == before
 
 
-def test_without_a_calibration_in_use_there_is_nothing_to_join(stand: Stand) -> None:
-    stand.manager.set_mirror(make_mirror(serial="T-2"))
+def test_without_a_calibration_in_use_there_is_nothing_to_join(rig: Rig) -> None:
+    rig.manager.set_mirror(make_mirror(serial="T-2"))
     with pytest.raises(Refusal, match="no calibration is in use") as caught:
-        stand.manager.add_recipes("known", book(0.01))
+        rig.manager.add_recipes("known", book(0.01))
     assert caught.value.error_code == ErrorCode.NOT_CALIBRATED
 
 
-def test_other_raw_data_never_replace_those_of_the_file(stand: Stand, calibration: Calibration) -> None:
-    before = stand.file.read_bytes()
+def test_other_raw_data_never_replace_those_of_the_file(rig: Rig, calibration: Calibration) -> None:
+    before = rig.file.read_bytes()
     other = replace(calibration, maps=replace(calibration.maps, sag=calibration.maps.sag + 1e-9))
     with pytest.raises(StoreError, match="raw data differ"):
-        stand.store.replace(other)
+        rig.store.replace(other)
     with pytest.raises(UnknownNameError):
-        stand.store.replace(replace(calibration, id="never-stored"))
-    assert stand.file.read_bytes() == before
+        rig.store.replace(replace(calibration, id="never-stored"))
+    assert rig.file.read_bytes() == before

@@ -52,10 +52,10 @@ def test_what_is_no_such_thing_is_refused_by_name(kind: Any, fields: dict[str, A
 
 
 def test_the_interferometer_keeps_the_time_of_a_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-    monkeypatch.setattr(DeformableMirrorClient, "call", lambda _self, *arguments: asked.append(arguments))
+    calls: list[Any] = []
+    monkeypatch.setattr(DeformableMirrorClient, "call", lambda _self, *arguments: calls.append(arguments))
     DeformableMirrorClient.__new__(DeformableMirrorClient).measure("night", timeout_s=7)
-    ((name, request, waits),) = asked
+    ((name, request, waits),) = calls
     assert (name, request.timeout) == ("measure", 7.0) and waits > 7.0, "its answer says why"
 
 
@@ -65,12 +65,12 @@ def test_what_takes_as_long_as_the_instrument_takes_is_not_given_up_before_its_n
     """Of 213 maps at 40 s each, which are two hours and more, or of one for which somebody presses a button."""
     waits: dict[str, float] = {}
 
-    def asked(_self: Any, name: str, request: Any, *rest: Any) -> None:
+    def record(_self: Any, name: str, request: Any, *rest: Any) -> None:
         assert name != "measure" or request.timeout == 0.0, "as configured"
         waits[name] = rest[-1]
 
     for way in ("call", "run_action"):
-        monkeypatch.setattr(DeformableMirrorClient, way, asked)
+        monkeypatch.setattr(DeformableMirrorClient, way, record)
     mirror = DeformableMirrorClient.__new__(DeformableMirrorClient)
     mirror.measure()
     mirror.update_calibration()
@@ -101,8 +101,8 @@ def test_a_client_in_a_launched_process_talks_to_the_mirror_that_it_is_for(
     namespace: str, place: str, domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What launch calls the user's own node, and where that is, is not the client's."""
-    told = ["vision", "--ros-args", "-r", "__ns:=/right", "-r", "__node:=my_vision", "-r", "image_raw:=/camera/image"]
-    monkeypatch.setattr("sys.argv", told)
+    argv = ["vision", "--ros-args", "-r", "__ns:=/right", "-r", "__node:=my_vision", "-r", "image_raw:=/camera/image"]
+    monkeypatch.setattr("sys.argv", argv)
     with DeformableMirrorClient(namespace, domain) as client:
         assert client.node.get_namespace() == place
         assert client.node.get_name().startswith("dm_client_")

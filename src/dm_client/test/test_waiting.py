@@ -63,17 +63,17 @@ def test_it_is_not_ready_while_either_says_otherwise(driver: int, able: int, cod
 
 def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine the lease of a node that goes on with a run may lapse for its client."""
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     heard, feedback = list[int](), list[str]()
     server: Any = SimpleNamespace(**vars(THERE) | {"heard": lambda: heard.append(len(feedback))})
-    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0
+    mirror._servers, mirror.clients, mirror._timeout_s = {"converge": server}, {"converge": None}, 1.0
 
     def run_goal(*_arguments: object, on_feedback: object, **_options: object) -> Converge.Result:
         on_feedback("step 1")  # type: ignore[operator]
         return Converge.Result()
 
     monkeypatch.setattr(connection, "run_goal", run_goal)
-    asked.run_action("converge", Converge.Goal(), feedback.append, 1.0)
+    mirror.run_action("converge", Converge.Goal(), feedback.append, 1.0)
     assert (heard, feedback) == ([0], ["step 1"])
 
 
@@ -82,8 +82,8 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(
     error: type[BaseException], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """rclpy's executor ends the whole process with it."""
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
-    asked._servers, asked.clients, asked._timeout_s = {"converge": THERE}, {"converge": None}, 1.0
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror._servers, mirror.clients, mirror._timeout_s = {"converge": THERE}, {"converge": None}, 1.0
     cancelled = list[bool]()
 
     def run_goal(*_arguments: object, on_feedback: Any, stop: Any, **_options: object) -> Converge.Result:
@@ -98,14 +98,14 @@ def test_an_error_in_feedback_cancels_the_goal_and_is_raised(
 
     monkeypatch.setattr(connection, "run_goal", run_goal)
     with pytest.raises(error, match="step 1"):
-        asked.run_action("converge", Converge.Goal(), fail, 1.0)
+        mirror.run_action("converge", Converge.Goal(), fail, 1.0)
     assert cancelled == [False, True]
 
 
 def test_a_topic_that_it_does_not_hear_is_named() -> None:
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     with pytest.raises(DeformableMirrorError, match="'zernike': must be one of actuator_state") as refused:
-        asked.latest("zernike")
+        mirror.latest("zernike")
     assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 
 
@@ -133,12 +133,12 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
         lambda mirror: mirror.latest("calibration", 60.0),
     ]
     with DeformableMirrorClient(domain=domain, timeout_s=60.0) as mirror:
-        told = list[str]()
+        texts = list[str]()
 
         def ask(way: Any) -> None:
             with pytest.raises(DeformableMirrorError) as ended:
                 way(mirror)
-            told.append(str(ended.value))
+            texts.append(str(ended.value))
 
         threads = [threading.Thread(target=ask, args=(way,)) for way in waits]
         for thread in threads:
@@ -148,7 +148,7 @@ def test_who_waits_in_another_thread_hears_that_the_client_was_closed(domain: in
         thread.join(5.0)
     for way in waits:  # and who asks only now
         ask(way)
-    assert len(told) == 6 and all(text.endswith("the client has been closed") for text in told)
+    assert len(texts) == 6 and all(text.endswith("the client has been closed") for text in texts)
     with pytest.raises(DeformableMirrorError, match="the client has been closed"):
         mirror.subscribe("another", ActuatorState, 1)
 
@@ -166,41 +166,41 @@ def test_who_waits_hears_that_rclpy_was_shut_down(domain: int) -> None:
 
 def test_a_name_that_is_not_served_is_refused(domain: int) -> None:
     with DeformableMirrorClient(domain=domain) as mirror:
-        asked = [
+        cases = [
             (lambda: mirror.call("nonsense", None), "hold_mirror, measure"),
             (lambda: mirror.run_action("nonsense", None, print, 1.0), "degauss, calibrate, move_focus"),
         ]
-        for ask, names in asked:
+        for ask, names in cases:
             with pytest.raises(DeformableMirrorError, match=f"'nonsense': must be one of .*{names}") as refused:
                 ask()
             assert refused.value.error_code == ErrorCode.UNKNOWN_NAME
 
 
 def test_a_service_that_is_not_there_is_not_waited_for_as_long_as_its_answer() -> None:
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     absent = SimpleNamespace(service_is_ready=lambda: False, srv_name="/measure")
-    asked._servers, asked.clients, asked._timeout_s = {"measure": THERE}, {"measure": absent}, 0.1
+    mirror._servers, mirror.clients, mirror._timeout_s = {"measure": THERE}, {"measure": absent}, 0.1
     with pytest.raises(DeformableMirrorError, match=r"no such service within 0\.1 s"):
-        asked.measure()
+        mirror.measure()
 
 
 def test_a_node_that_never_came_is_named() -> None:
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     absent = SimpleNamespace(service_is_ready=lambda: False, srv_name="/measure")
     never = Liveliness.__new__(Liveliness)
     never.name, never.lost, never.starts, never._born = "interferometer", False, 0, -math.inf
-    asked._servers, asked.clients, asked._timeout_s = {"measure": never}, {"measure": absent}, 0.1
+    mirror._servers, mirror.clients, mirror._timeout_s = {"measure": never}, {"measure": absent}, 0.1
     with pytest.raises(
         DeformableMirrorError, match="measure: the node interferometer is not running: start it"
-    ) as told:
-        asked.measure()
-    assert told.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
+    ) as refused:
+        mirror.measure()
+    assert refused.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
 
 
 def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     names = ("set_signals", "move_focus")
-    asked._servers, asked.clients, asked._timeout_s = dict.fromkeys(names, THERE), dict.fromkeys(names), 10.0
+    mirror._servers, mirror.clients, mirror._timeout_s = dict.fromkeys(names, THERE), dict.fromkeys(names), 10.0
     limits = list[tuple[float, ...]]()  # of waiting, and after which a request to a service is sent again
 
     def answer(_client: object, request: Any, timeout_s: float, *more: Any, **_options: object) -> Any:
@@ -210,18 +210,18 @@ def test_a_way_is_waited_for_however_slow_the_limits_are(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(connection, "call", answer)
     monkeypatch.setattr(connection, "run_goal", answer)
-    asked.set_signals([0.0] * 37)
-    asked.move_focus(0.01)
-    asked.set_signals([0.0] * 37, wait=False)
+    mirror.set_signals([0.0] * 37)
+    mirror.move_focus(0.01)
+    mirror.set_signals([0.0] * 37, wait=False)
     assert limits == [(math.inf, 10.0), (math.inf,), (10.0, 10.0)]
 
 
 def test_what_asks_inside_a_callback_is_refused_at_once() -> None:
     """Nobody would take the answer."""
-    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
-    asked._background = SimpleNamespace(is_here=True)  # type: ignore[assignment]
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    mirror._background = SimpleNamespace(is_here=True)  # type: ignore[assignment]
     with pytest.raises(DeformableMirrorError, match=r"flatten: .* call it from another thread"):
-        asked.flatten()
+        mirror.flatten()
 
 
 def test_a_program_that_closes_nothing_ends_in_order(domain: int) -> None:

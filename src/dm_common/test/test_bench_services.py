@@ -98,11 +98,11 @@ def test_a_map_takes_as_long_when_the_clock_is_set_meanwhile(
 
 
 def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: Observer) -> None:
-    asked: list[str] = []
+    called: list[str] = []
 
     def serve(name: str) -> None:
         def answer(_request: Any, response: Any) -> Any:
-            asked.append(name)
+            called.append(name)
             return response
 
         observer.node.create_service(SetSignals, name, answer)
@@ -119,4 +119,4 @@ def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: O
             with pytest.raises(Cancelled, match="the process ends"):
                 command()
         node.destroy_node()
-    assert asked == ["/left/set_signals", "/left/remapped"]
+    assert called == ["/left/set_signals", "/left/remapped"]

@@ -151,9 +151,9 @@ def test_while_the_link_is_lost_nobody_knows_whether_the_outputs_hold(away: floa
 def test_what_stood_counts_until_the_first_write_of_a_degauss() -> None:
     """The driver may say that it moves before that write, with the stamp of the one before."""
     crept = []
-    for told_before in (False, True):
+    for reported_before in (False, True):
         observer, swings = held_for_a_day(), {"turns": 1, "moving": True, "history_known": False}
-        if told_before:
+        if reported_before:
             observer.observe(report(0.0, 0.5, heard=DAY, **swings))
         for time, signal in ((DAY, 0.49), (DAY + 1.0, -0.5)):
             observer.observe(report(time, signal, heard=time, **swings))

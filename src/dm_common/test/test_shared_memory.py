@@ -89,13 +89,13 @@ def test_with_peers_or_another_middleware_nodes_stay_as_they_were_told(
     environment: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A Fast DDS profile keeps no other middleware to the machine, and only LOCALHOST and SUBNET heed peers."""
-    told = {RANGE: "LOCALHOST", PROFILE: WHOLE}
+    expected = {RANGE: "LOCALHOST", PROFILE: WHOLE}
     monkeypatch.setenv(PEERS, "192.168.3.4")
-    assert environment("LOCALHOST", WHOLE) == told
+    assert environment("LOCALHOST", WHOLE) == expected
     assert environment("SUBNET", WHOLE) == {RANGE: "SUBNET", PROFILE: UDP}
     monkeypatch.delenv(PEERS)
     monkeypatch.setattr(shared_memory, "get_rmw_implementation_identifier", lambda: "rmw_cyclonedds_cpp")
-    assert environment("LOCALHOST", WHOLE) == told
+    assert environment("LOCALHOST", WHOLE) == expected
 
 
 @pytest.fixture

@@ -15,12 +15,12 @@ from waiting import wait_until
 
 
 def test_a_run_that_no_driver_was_there_for_is_not_made_up_for_later(observer: Observer) -> None:
-    asked: list[int] = []
+    served: list[int] = []
     results: list[Any] = []
     ended = threading.Event()
 
     def serve(handle: Any) -> tuple[str, Any]:
-        asked.append(handle.request.steps)
+        served.append(handle.request.steps)
         return "succeed", Degauss.Result(duration=0.5)
 
     def end(*result: Any) -> None:
@@ -35,4 +35,4 @@ def test_a_run_that_no_driver_was_there_for_is_not_made_up_for_later(observer: O
     assert not ended.wait(1.0)
     client.start(StartDegauss(2, 20))
     assert ended.wait(10.0)
-    assert asked == [20] and results == [(2, 0.5, None)]
+    assert served == [20] and results == [(2, 0.5, None)]

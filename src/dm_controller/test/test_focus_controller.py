@@ -297,9 +297,9 @@ def test_both_ends_of_the_range_that_is_told_may_be_asked_for(bench: Bench, stro
     for name in ("influence_zernike", "influence_sag"):
         setattr(message, name, doubles(stroke * np.array(getattr(message, name))))
     bench.do(bench.controller.use(message, MIRROR))
-    told = capabilities_message(bench.controller, MIRROR, VALUES, bench.now).message
+    message = capabilities_message(bench.controller, MIRROR, VALUES, bench.now).message
     beyond = bench.ask(1.0)
-    for text in (told, str(beyond.refusal)):
+    for text in (message, str(beyond.refusal)):
         found = re.search(pattern, text)
         assert found is not None
         for end in found.groups():
@@ -573,11 +573,11 @@ def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     bench.report()
     before = bench.ask(dry_run=True)
     assert "moved before" in before.unknown
-    told = bench.capabilities
+    published = bench.capabilities
     bench.degauss()
     bench.time += 60.0  # what the moment between record and report may have left has faded
     bench.report()
-    assert bench.capabilities > told
+    assert bench.capabilities > published
     after = bench.ask(dry_run=True)
     assert after.unknown == ""
     assert move_of(after).plan.max_zernike_upper < 0.1 * move_of(before).plan.max_zernike_upper
@@ -942,8 +942,8 @@ def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) ->
     bench.wait(5.0)
     assert bench.refusal().error_code == ErrorCode.PREEMPTED and bench.outcomes[-1].request.curvature == 0.01
     assert bench.error(move_of(order).effective) < 1e-4
-    told = health(bench.controller, VALUES, bench.now).values
-    assert (told["curvature"], told["held"]) == (0.02, True)
+    values = health(bench.controller, VALUES, bench.now).values
+    assert (values["curvature"], values["held"]) == (0.02, True)
 
 
 def test_a_clock_that_jumps_while_a_command_is_on_its_way_leaves_its_shape_held(bench: Bench) -> None:
@@ -1016,9 +1016,9 @@ def test_health_says_what_stands_as_long_as_it_does() -> None:
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values
     bench.ask(0.02)
     bench.wait(40.0)
-    told = health(bench.controller, VALUES, bench.now).values
-    assert (told["curvature"], told["held"]) == (0.02, True) and bench.controller.hold.corrections
-    assert float(str(told["age"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(told["bound"])) < 3e-6
+    values = health(bench.controller, VALUES, bench.now).values
+    assert (values["curvature"], values["held"]) == (0.02, True) and bench.controller.hold.corrections
+    assert float(str(values["age"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(values["bound"])) < 3e-6
     bench.degauss()
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values
 
@@ -1040,9 +1040,9 @@ def test_health_tells_what_is_predicted_of_a_shape_apart_from_what_is_promised_b
     assert bench.controller.active is not None
     order = bench.ask(bench.controller.active.reachable_range(FocusTarget(0.0), VALUES["reachable_tolerance"])[1])
     bench.wait(1.0)
-    told, plan = health(bench.controller, VALUES, bench.now).values, move_of(order).plan
-    assert told["predicted"] == plan.max_zernike > 1e-8
-    assert float(str(told["bound"])) == pytest.approx(plan.max_zernike_upper, rel=1e-3)
+    values, plan = health(bench.controller, VALUES, bench.now).values, move_of(order).plan
+    assert values["predicted"] == plan.max_zernike > 1e-8
+    assert float(str(values["bound"])) == pytest.approx(plan.max_zernike_upper, rel=1e-3)
 
 
 def test_the_bound_of_what_stands_follows_the_calibration(bench: Bench) -> None:
@@ -1066,7 +1066,7 @@ def test_the_bound_of_what_stands_follows_the_calibration(bench: Bench) -> None:
 
 def test_the_bound_holds_where_nothing_holds_the_shape() -> None:
     """With the law known in full; what is held keeps the bound of the plan."""
-    told = []
+    states = []
     for held in (True, False):
         bench = Bench(**{"hold.enable": held})
         bench.degauss()
@@ -1074,19 +1074,19 @@ def test_the_bound_holds_where_nothing_holds_the_shape() -> None:
         bench.report()
         bench.mirror = LAW.advance(bench.mirror, bench.time)
         order = bench.ask(0.02)
-        told.append(state_message(order, VALUES, None))
-    assert bench.controller.active is not None and [state.creep_held for state in told] == [True, False]
+        states.append(state_message(order, VALUES, None))
+    assert bench.controller.active is not None and [state.creep_held for state in states] == [True, False]
     planner, plan = bench.controller.active.planner, move_of(order).plan
-    assert told[0].predicted_max_zernike_upper == plan.max_zernike_upper
-    assert told[0].predicted_rms_upper == plan.rms_upper < told[1].predicted_rms_upper
-    assert told[1].message.endswith("most of that for creep, which nothing corrects")
+    assert states[0].predicted_max_zernike_upper == plan.max_zernike_upper
+    assert states[0].predicted_rms_upper == plan.rms_upper < states[1].predicted_rms_upper
+    assert states[1].message.endswith("most of that for creep, which nothing corrects")
     for age in (99.0, 3600.0):
         bench.wait(age, 10.0)
         error = planner.drift(bench.mirror, bench.time, move_of(order).effective)
         bound = float(str(health(bench.controller, VALUES, bench.now).values["bound"]))
         assert bound == pytest.approx(error + plan.max_zernike_upper, rel=1e-3)
         if age < 100.0:
-            assert plan.max_zernike_upper < error < told[1].predicted_max_zernike_upper < 1.1 * bound
+            assert plan.max_zernike_upper < error < states[1].predicted_max_zernike_upper < 1.1 * bound
 
 
 @pytest.mark.slow
@@ -1100,7 +1100,7 @@ def test_a_shape_written_again_after_a_lost_link_is_told_with_the_bound_of_an_un
     bench.wait(600.0)
     bench.state = ActuatorState.STATE_ACTIVE
     bench.report()
-    told = health(bench.controller, VALUES, bench.now).values
-    assert (told["curvature"], told["held"]) == (0.02, False)
+    values = health(bench.controller, VALUES, bench.now).values
+    assert (values["curvature"], values["held"]) == (0.02, False)
     assert bench.controller.active is not None
-    assert float(str(told["bound"])) > max(bound, bench.controller.active.planner.error_bound(False, 0.0))
+    assert float(str(values["bound"])) > max(bound, bench.controller.active.planner.error_bound(False, 0.0))

@@ -50,18 +50,18 @@ def started_writer(
     **arguments: Any,
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
     """A writer that is not enabled yet, and what it told."""
-    told: list[tuple[WriterState, bool]] = []
+    reports: list[tuple[WriterState, bool]] = []
     writer = ActuatorWriter(
         electronics(ElectronicsSettings("127.0.0.1", unit.port, timeout_s=0.5)),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
         SafetyLimiter(limits(slew_rate)),
         np.full(37, -1.0),
-        listener=lambda state, edge: told.append((state, edge)),
+        listener=lambda state, edge: reports.append((state, edge)),
         **arguments,
     )
     writer.start()
     try:
-        yield writer, told
+        yield writer, reports
     finally:
         assert writer.stop()
 
@@ -70,10 +70,10 @@ def started_writer(
 def running_writer(
     unit: Edac40TcpUnit | Edac40UdpUnit, *arguments: Any, **keywords: Any
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
-    with started_writer(unit, *arguments, **keywords) as (writer, told):
+    with started_writer(unit, *arguments, **keywords) as (writer, reports):
         assert writer.wait_for_link(5)
         assert writer.enable(5)
-        yield writer, told
+        yield writer, reports
 
 
 def shape(value: float) -> np.ndarray:
@@ -110,7 +110,7 @@ def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Ed
 
 
 def test_a_small_command_is_one_frame_and_a_large_one_a_ramp(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit) as (writer, told):
+    with running_writer(unit) as (writer, reports):
         assert writer.command(shape(-0.95)).wait(5) is Outcome.REACHED
         wait_until(lambda: len(unit.frames) == 2)
         move = writer.command(shape(0.9))
@@ -120,14 +120,14 @@ def test_a_small_command_is_one_frame_and_a_large_one_a_ramp(unit: Edac40TcpUnit
     assert on_wire[1] == pytest.approx(-0.95, abs=CODE)
     assert on_wire[-1] == pytest.approx(0.9, abs=CODE)
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
-    state, edge = told[-1]
+    state, edge = reports[-1]
     assert not state.link_up or (edge and state.moving is None)
-    ramp = [edge for state, edge in told if 2 < state.sequence <= 21]
+    ramp = [edge for state, edge in reports if 2 < state.sequence <= 21]
     assert ramp == [True, *[False] * 17, True]  # first and last are edges
 
 
 def test_the_slew_rate_holds(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=20.0) as (writer, _told):
+    with running_writer(unit, slew_rate=20.0) as (writer, _reports):
         begun = time.monotonic()
         writer.command(shape(0.0)).wait(5)
         writer.command(shape(-0.5)).wait(5)
@@ -135,7 +135,7 @@ def test_the_slew_rate_holds(unit: Edac40TcpUnit) -> None:
 
 
 def test_a_newer_command_takes_over_in_the_middle_of_a_ramp(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=10.0) as (writer, _told):
+    with running_writer(unit, slew_rate=10.0) as (writer, _reports):
         first = writer.command(shape(1.0))
         wait_until(lambda: len(unit.frames) > 4)
         second = writer.command(shape(-1.0))
@@ -151,7 +151,7 @@ def test_a_newer_command_takes_over_in_the_middle_of_a_ramp(unit: Edac40TcpUnit)
 
 @pytest.mark.slow
 def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=10.0) as (writer, _told):
+    with running_writer(unit, slew_rate=10.0) as (writer, _reports):
         assert writer.command(shape(-0.5)).wait(5) is Outcome.REACHED
         turns = writer.state().turns
         correction = writer.correct(shape(-0.49), turns)
@@ -171,7 +171,7 @@ def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -
 def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
     generator = np.random.default_rng(7)
     limiter = SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37))
-    with running_writer(unit, slew_rate=200.0) as (writer, _told):
+    with running_writer(unit, slew_rate=200.0) as (writer, _reports):
         last = None
         for number in range(60):
             try:
@@ -193,7 +193,7 @@ def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac
 
 
 def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit) as (writer, _told):
+    with running_writer(unit) as (writer, _reports):
         assert not writer.state().history_known
         move = degauss(writer, 0.5, 10, shape(0.2))
         assert move.wait(10) is Outcome.REACHED
@@ -209,7 +209,7 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
 
 
 def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=1e4) as (writer, _told):
+    with running_writer(unit, slew_rate=1e4) as (writer, _reports):
         assert degauss(writer, 0.0, 4, shape(0.2)).wait(10) is Outcome.REACHED
         assert not writer.state().history_known, "an eighth of the first half-swing may be left"
         assert degauss(writer, 0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
@@ -219,7 +219,7 @@ def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(u
 
 
 def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=20.0) as (writer, told):
+    with running_writer(unit, slew_rate=20.0) as (writer, reports):
         assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
         assert writer.state().turns == 1 and writer.state().turned_at == pytest.approx(0.5, abs=CODE)
         left = writer.command(shape(-0.9))
@@ -227,24 +227,24 @@ def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> N
         assert writer.command(shape(0.9)).wait(5) is Outcome.REACHED
         assert left.wait(5) is Outcome.SUPERSEDED
         assert writer.state().turns == 3
-    lowest = min(state.applied[0] for state, _ in told if state.applied is not None and state.turns >= 1)
-    places = {state.turns: state.turned_at[0] for state, _ in told if state.turned_at is not None}
+    lowest = min(state.applied[0] for state, _ in reports if state.applied is not None and state.turns >= 1)
+    places = {state.turns: state.turned_at[0] for state, _ in reports if state.turned_at is not None}
     assert places[2] == pytest.approx(lowest, abs=CODE) and places[3] == pytest.approx(0.9, abs=CODE)
 
 
 @pytest.mark.slow
 def test_a_move_of_one_step_that_takes_over_hides_no_turn(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=2.0) as (writer, told):
+    with running_writer(unit, slew_rate=2.0) as (writer, reports):
         writer.command(shape(0.9))
         wait_until(lambda: (applied := writer.state().applied) is not None and applied[0] > -0.5)
         applied = writer.state().applied
         assert applied is not None and writer.command(applied - 0.01).wait(5) is Outcome.REACHED
         assert writer.state().turns == 2
-    assert {0, 1, 2} <= {state.turns for state, edge in told if edge}
+    assert {0, 1, 2} <= {state.turns for state, edge in reports if edge}
 
 
 def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=40.0) as (writer, _told):
+    with running_writer(unit, slew_rate=40.0) as (writer, _reports):
         assert degauss(writer, 0.1, 2, shape(0.0)).wait(5) is Outcome.REACHED
         move = degauss(writer, 0.0, 100, shape(0.0))
         wait_until(lambda: writer.state().moving is Kind.DEGAUSS and not writer.state().history_known)
@@ -256,7 +256,7 @@ def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40
 
 @pytest.mark.slow
 def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, watchdog_s=0.6) as (writer, _told):
+    with running_writer(unit, watchdog_s=0.6) as (writer, _reports):
         assert writer.command(shape(0.0)).wait(5) is Outcome.REACHED
         wait_until(lambda: signals_of(unit.frames[-1:])[0] == pytest.approx(-1.0, abs=CODE), what="safe shape")
         frames = len(unit.frames)
@@ -267,7 +267,7 @@ def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
 
 @pytest.mark.slow
 def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=20.0) as (writer, _told):
+    with running_writer(unit, slew_rate=20.0) as (writer, _reports):
         assert writer.command(shape(0.3)).wait(5) is Outcome.REACHED
         move = degauss(writer, 0.0, 100, shape(0.0))
         wait_until(lambda: move.begun > 2)
@@ -312,13 +312,13 @@ def test_an_impossible_degauss_is_refused(amplitude: float, steps: int) -> None:
 
 @pytest.mark.slow
 def test_a_degauss_longer_than_the_watchdog_is_finished(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=40.0, watchdog_s=0.1) as (writer, _told):
+    with running_writer(unit, slew_rate=40.0, watchdog_s=0.1) as (writer, _reports):
         assert degauss(writer, 0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
 
 
 @pytest.mark.slow
 def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=4.0) as (writer, told):
+    with running_writer(unit, slew_rate=4.0) as (writer, reports):
         degauss(writer, 0.05, 1, shape(-0.9)).wait(5)
         move = writer.command(shape(0.6))
         wait_until(lambda: writer.state().sequence > 15)
@@ -337,12 +337,12 @@ def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
         assert writer.state().fault == ""
         assert (writer.counters.link_losses, writer.counters.reconnects) == (1, 1)
         assert writer.command(shape(-1.0)).wait(10) is Outcome.REACHED
-    assert [state.link_up for state, _edge in told].count(False) >= 1
+    assert [state.link_up for state, _edge in reports].count(False) >= 1
 
 
 @pytest.mark.slow
 def test_a_unit_that_restarts_while_idle_gets_the_shape_again(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit) as (writer, _told):
+    with running_writer(unit) as (writer, _reports):
         assert writer.command(shape(-0.92)).wait(5) is Outcome.REACHED
         wait_until(lambda: len(unit.frames) == 2)
         unit.drop_client()
@@ -351,7 +351,7 @@ def test_a_unit_that_restarts_while_idle_gets_the_shape_again(unit: Edac40TcpUni
 
 
 def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit) as (writer, _told):
+    with running_writer(unit) as (writer, _reports):
         writer.command(shape(0.5)).wait(5)
         moving = writer.command(shape(-0.5))
         assert writer.disable(5) is Outcome.REACHED
@@ -372,7 +372,7 @@ def test_a_unit_slower_than_the_limits_is_waited_for_on_the_way_to_the_safe_shap
             time.sleep(0.03)
             super()._do_write(codes, wired)
 
-    with running_writer(unit, electronics=Slow) as (writer, _told):
+    with running_writer(unit, electronics=Slow) as (writer, _reports):
         assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
         assert writer.disable(0.2) is Outcome.REACHED
         wait_until(lambda: signals_of(unit.frames[-1:]) == pytest.approx(-1.0, abs=CODE))
@@ -416,7 +416,7 @@ def test_the_safe_shape_is_reached_although_the_link_comes_late(unit: Edac40TcpU
         replace(SCALE, volts_max=400.0).exact_codes(shape(0.35))
     )  # 270 V, by a driver that was killed
     unit.unplug()
-    with started_writer(unit, electronics=Counting, last=LastShape(path, 37)) as (writer, _told):
+    with started_writer(unit, electronics=Counting, last=LastShape(path, 37)) as (writer, _reports):
         assert not writer.enable(0.0)
         fail_to_connect(writer)
         assert writer.state().moving is None
@@ -439,7 +439,7 @@ def test_a_link_lost_on_the_way_to_the_safe_shape(unit: Edac40TcpUnit, tmp_path:
     """The way goes on, unless an accepted command took its place: then the shape stays where the link was lost."""
     path = tmp_path / "unit.shape"
     LastShape(path, 37).note(SCALE.exact_codes(shape(0.8)))
-    with started_writer(unit, slew_rate=1.0, last=LastShape(path, 37)) as (writer, _told):
+    with started_writer(unit, slew_rate=1.0, last=LastShape(path, 37)) as (writer, _reports):
         assert writer.wait_for_link(5)
         writer.enable(0.0)
         wait_until(lambda: len(unit.frames) > 2)
@@ -517,7 +517,7 @@ def test_a_second_driver_of_a_unit_that_takes_frames_of_anybody_waits(tmp_path: 
 
 @pytest.mark.slow
 def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=2.0, electronics=Counting) as (writer, _told):
+    with running_writer(unit, slew_rate=2.0, electronics=Counting) as (writer, _reports):
         electronics = writer._electronics
         assert isinstance(electronics, Counting)
         before, frames = electronics.checks, writer.counters.frames
@@ -531,14 +531,14 @@ def test_the_link_is_looked_at_in_a_move_and_between_commands_too(unit: Edac40Tc
 
 @pytest.mark.slow
 def test_disable_without_a_link_says_so(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit) as (writer, _told):
+    with running_writer(unit) as (writer, _reports):
         unit.unplug()
         wait_until(lambda: not writer.state().link_up)
         assert writer.disable(5) is Outcome.LINK_LOST
 
 
 def test_stop_ends_a_move_that_somebody_waits_for(unit: Edac40TcpUnit) -> None:
-    with running_writer(unit, slew_rate=1.0) as (writer, _told):
+    with running_writer(unit, slew_rate=1.0) as (writer, _reports):
         move = writer.command(shape(1.0))
         wait_until(lambda: len(unit.frames) > 1)
     assert move.wait(5) is Outcome.STOPPED
@@ -555,9 +555,9 @@ def test_a_defect_in_a_back_end_does_not_end_the_thread(unit: Edac40TcpUnit) -> 
                 raise ZeroDivisionError("injected")
             super()._do_write(codes, wired)
 
-    with running_writer(unit, electronics=Faulty) as (writer, told):
+    with running_writer(unit, electronics=Faulty) as (writer, reports):
         move = writer.command(shape(-0.9))
         assert move.wait(5) is Outcome.LINK_LOST
         wait_until(lambda: writer.state().link_up, what="reconnection")
-        assert any("ZeroDivisionError: injected" in state.fault for state, _edge in told)
+        assert any("ZeroDivisionError: injected" in state.fault for state, _edge in reports)
         assert writer.command(shape(-0.9)).wait(5) is Outcome.REACHED

@@ -71,10 +71,10 @@ def test_step_of_one_write(step: float, actuator: int, side: float) -> None:
 @pytest.mark.parametrize("beyond", [0.0, 5e-12, 5e-11, SLACK])
 @pytest.mark.parametrize("steps", [1, 2, 19])
 def test_every_step_of_a_way_may_be_written(steps: int, beyond: float) -> None:
-    judge, stands = limiter(step=0.1), np.full(7, -1.0)
-    for shape in judge.ramp(stands, np.full(7, -1.0 + 0.1 * steps + beyond)):
-        judge.check_write(stands, shape)
-        stands = shape
+    judge, reached = limiter(step=0.1), np.full(7, -1.0)
+    for shape in judge.ramp(reached, np.full(7, -1.0 + 0.1 * steps + beyond)):
+        judge.check_write(reached, shape)
+        reached = shape
 
 
 @given(signals=st.lists(floats, max_size=60))

@@ -67,15 +67,15 @@ def test_custom_wiring_with_an_unconnected_actuator() -> None:
     # What it was asked for it never reaches, and where it rests is no limit of the signals.
     limiter = SafetyLimiter(DriverLimits(actuators=3, low=-0.5))
     configuration: Any = SimpleNamespace(output=stage, limiter=limiter, electronics=SimpleNamespace(knows_volts=True))
-    asked = np.array([0.5, 0.5, 0.0])
-    moving = WriterState(True, True, Kind.COMMAND, asked, signals, volts, 0, 1, True, 0, 0, None, "")
+    wanted = np.array([0.5, 0.5, 0.0])
+    moving = WriterState(True, True, Kind.COMMAND, wanted, signals, volts, 0, 1, True, 0, 0, None, "")
     state = state_message(moving, None, configuration, "mirror", MirrorHold(lambda: 0.0))
     on_its_way = ActuatorState.FLAG_RAMPING | ActuatorState.FLAG_AT_LIMIT
     assert list(state.flags) == [on_its_way, ActuatorState.FLAG_UNUSED, 0]
     lost = replace(moving, link_up=False, enabled=False, fault="no route")
-    told = state_message(lost, None, configuration, "mirror", MirrorHold(lambda: 0.0))
-    assert told.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
-    assert told.message == "the driver is not active, and the drive electronics are unreachable: no route"
+    message = state_message(lost, None, configuration, "mirror", MirrorHold(lambda: 0.0))
+    assert message.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+    assert message.message == "the driver is not active, and the drive electronics are unreachable: no route"
 
 
 def test_vendor_rule_when_the_range_is_the_whole_dac() -> None:

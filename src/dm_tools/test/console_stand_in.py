@@ -126,7 +126,7 @@ class Goal:
     def __init__(self, node: FakeNode, number: int) -> None:
         self.node, self.identity = node, SimpleNamespace(uuid=[number] * 16)
 
-    def tell(self, status: int) -> None:
+    def publish_status(self, status: int) -> None:
         entry = SimpleNamespace(goal_info=SimpleNamespace(goal_id=self.identity), status=status)
         self.node.callbacks["calibrate/_action/status"](SimpleNamespace(status_list=[entry]))
 

@@ -250,9 +250,9 @@ def hundred_clients(rig: FocusRig, random: Random, record: FaultRecord) -> None:
         output, errors = client.communicate()
         if client.returncode != 0:
             raise RigError(f"clients: {errors[-500:]}")
-        told = json.loads(output.splitlines()[-1])
-        curvatures = set(told.pop("curvatures"))
-        figures.update(told)
+        counts = json.loads(output.splitlines()[-1])
+        curvatures = set(counts.pop("curvatures"))
+        figures.update(counts)
         counts = Counter(state.curvature for state in list(rig.focus_states))
         figures["twice"] += sum(counts[curvature] > 1 for curvature in curvatures)
     unanswered = figures["asked"] - figures["answered"]

@@ -76,14 +76,14 @@ def _run_apart(name: str, folder: Path, domain: int, seed: int, record: FaultRec
         raise
     if process.returncode != 0:
         raise RigError(errors.strip()[-800:])
-    told = FaultRecord(**json.loads(output.splitlines()[-1]))
-    if told.skipped:
-        raise NotPermittedError(told.skipped)
-    record.injected += told.injected
-    record.limit_violations += told.limit_violations
-    record.lost += told.lost
-    record.recovery_s += told.recovery_s
-    record.remarks += told.remarks
+    result = FaultRecord(**json.loads(output.splitlines()[-1]))
+    if result.skipped:
+        raise NotPermittedError(result.skipped)
+    record.injected += result.injected
+    record.limit_violations += result.limit_violations
+    record.lost += result.lost
+    record.recovery_s += result.recovery_s
+    record.remarks += result.remarks
 
 
 def main() -> int:

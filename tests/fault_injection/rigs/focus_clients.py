@@ -80,7 +80,7 @@ class Clients:
             self.counts["wrong"] += state.curvature != curvature
             self.counts["wordless"] += state.error_code != ErrorCode.OK and not state.message
 
-    def _asked(self, curvature: float | None = None) -> None:
+    def _count_request(self, curvature: float | None = None) -> None:
         with self._lock:
             self.counts["asked"] += 1
             if curvature is not None:
@@ -89,7 +89,7 @@ class Clients:
     def _focus(self, client: Any, random: Random) -> None:
         for _ in range(self._rounds):
             curvature = random.uniform(-REACH, REACH)
-            self._asked(curvature)
+            self._count_request(curvature)
             try:
                 answer = call(client, SetFocus.Request(request=FocusRequest(curvature=curvature)), ANSWER_S)
             except ServiceCallError:
@@ -98,7 +98,7 @@ class Clients:
 
     def _flatten(self, client: Any, _random: Random) -> None:
         for _ in range(self._rounds):
-            self._asked()
+            self._count_request()
             try:
                 answer = call(client, Flatten.Request(), ANSWER_S)
             except ServiceCallError:
@@ -108,7 +108,7 @@ class Clients:
     def _move(self, client: Any, random: Random) -> None:
         for _ in range(self._rounds):
             curvature = random.uniform(-REACH, REACH)
-            self._asked()
+            self._count_request()
             accepted = client.send_goal_async(MoveFocus.Goal(request=FocusRequest(curvature=curvature)))
             if not _wait(accepted):
                 continue

@@ -241,7 +241,7 @@ class FocusRig(DriverRig):
         """Whether the actuators stand in this shape, but for corrections of creep."""
         return same_shape(self.signals, signals)
 
-    def told_of(self, curvature: float) -> list[FocusState]:
+    def states_of(self, curvature: float) -> list[FocusState]:
         """All that `focus_state` said of the request of just this curvature."""
         return [state for state in list(self.focus_states) if state.curvature == curvature]
 
@@ -253,7 +253,7 @@ class FocusRig(DriverRig):
         """
 
         def settled() -> bool:
-            refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
+            refused = any(answer.error_code != ErrorCode.OK for answer in self.states_of(state.curvature))
             return refused or self.near(state.signals) or (loop and overtaken(list(self.states), state))
 
         if state.error_code != ErrorCode.OK:
@@ -275,7 +275,7 @@ class FocusRig(DriverRig):
         """
         begun = time.monotonic()
 
-        def stands() -> bool:
+        def applied() -> bool:
             if not self._clients[SetFocus].service_is_ready():
                 return False
             request = SetFocus.Request(request=FocusRequest(curvature=self.curvature(random)))
@@ -292,5 +292,5 @@ class FocusRig(DriverRig):
                 return False
             return True
 
-        self.wait(stands, "a request that is carried out")
+        self.wait(applied, "a request that is carried out")
         return time.monotonic() - begun
