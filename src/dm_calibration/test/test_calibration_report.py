@@ -220,7 +220,7 @@ def test_the_certificate_says_what_checks_have_shown_since(calibration: Calibrat
         "./dm status",
     ):
         assert expected in first
-    patient = html_page("", sections(calibration, file, JUDGED_BY | {"updates.surprises_max": 4})[:1])
+    patient = html_page("", sections(calibration, file, CRITERIA | {"updates.surprises_max": 4})[:1])
     assert "calibrate again" not in patient and "Used without actuator 5" in patient
 
 

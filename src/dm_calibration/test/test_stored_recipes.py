@@ -76,9 +76,9 @@ def test_the_next_start_uses_what_was_in_use_last(rig: Rig, calibration: Calibra
     newer = rig.store.save(replace(calibration, id="newer", created_ns=calibration.created_ns + 1))
     used, reason = rig.manager.load_last()
     assert (used.id, reason) == ("known", "")
-    stand.file.unlink()
-    used, reason = stand.manager.load_last()
-    assert used.id == "newer" == stand.store.last_in_use(calibration.mirror_serial)
+    rig.file.unlink()
+    used, reason = rig.manager.load_last()
+    assert used.id == "newer" == rig.store.last_in_use(calibration.mirror_serial)
     assert reason.startswith("the calibration last in use, known, cannot be loaded: calibration 'known': no such file")
     for content in (b"newer\n", b"~nobody", b"../newer", b"\xff"):
         (rig.store.folder / "in_use_T-1.txt").write_bytes(content)
@@ -88,12 +88,12 @@ def test_the_next_start_uses_what_was_in_use_last(rig: Rig, calibration: Calibra
         rig.manager.load_last()
 
 
-def test_a_disk_that_takes_no_note_is_a_warning(stand: Stand, calibration: Calibration) -> None:
-    (stand.store.folder / "in_use_T-1.txt").unlink()
-    (stand.store.folder / "in_use_T-1.txt").mkdir()
-    assert "warning: known is in use, but could not be noted for the next start: " in stand.manager.use(calibration)
-    assert stand.published[-1] is calibration
-    assert "could not be noted for the next start: " in stand.manager.load("known")[1]
+def test_a_disk_that_takes_no_note_is_a_warning(rig: Rig, calibration: Calibration) -> None:
+    (rig.store.folder / "in_use_T-1.txt").unlink()
+    (rig.store.folder / "in_use_T-1.txt").mkdir()
+    assert "warning: known is in use, but could not be noted for the next start: " in rig.manager.use(calibration)
+    assert rig.published[-1] is calibration
+    assert "could not be noted for the next start: " in rig.manager.load("known")[1]
 
 
 def test_recipes_join_the_calibration_and_its_file(rig: Rig) -> None:
@@ -126,13 +126,12 @@ def test_one_that_promises_clearly_less_is_used_with_a_warning(rig: Rig, calibra
         rig.store.save(made)
         return made
 
-    assert stand.manager.use(promising(1.9)) == ""
+    assert rig.manager.use(promising(1.9)) == ""
     assert (
-        "warning: it promises" in (said := stand.manager.use(promising(40.0)))
-        and "of of_1.9, which it replaces" in said
+        "warning: it promises" in (said := rig.manager.use(promising(40.0))) and "of of_1.9, which it replaces" in said
     )
-    assert stand.manager.in_use is not None and stand.manager.in_use.id == "of_40"
-    assert stand.manager.use(calibration) == ""
+    assert rig.manager.in_use is not None and rig.manager.in_use.id == "of_40"
+    assert rig.manager.use(calibration) == ""
 
 
 def test_a_write_that_fails_leaves_everything_as_it_was(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -114,9 +114,11 @@ class DeformableMirrorClient(Connection):
     # --- what is known ---
 
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
-        """The latest message on a topic that it hears. Raises DeformableMirrorError for others, or if none came."""
-        if topic not in self._heard:
-            text = f"{topic!r}: must be one of {', '.join(sorted(self._heard))}, or be subscribed to first (hear)"
+        """The latest message on a topic that it subscribes. Raises DeformableMirrorError for others, or if none came."""
+        if topic not in self._subscribed:
+            text = (
+                f"{topic!r}: must be one of {', '.join(sorted(self._subscribed))}, or be subscribed first (subscribe)"
+            )
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")

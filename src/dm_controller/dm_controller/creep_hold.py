@@ -59,10 +59,10 @@ class CreepHold:
 
     def not_confirmed(self) -> None:
         """The driver has not taken the last command: go on holding the shape before it, if it is still there."""
-        stood = self._monitor.stood
+        previous = self._monitor.previous_order
         self.end("the driver did not accept the command")
-        if stood is not None:
-            self._monitor.order = stood
+        if previous is not None:
+            self._monitor.order = previous
 
     def end(self, reason: str) -> None:
         """Leave the shape as it is, and forget the one before."""

@@ -190,8 +190,8 @@ class MoveFocusAction:
         settle = goal.settle_time or self._values["settle_time"]
         if not sleep(node.get_clock(), settle, lambda: self._to_stop(handle) or bool(self._progress(order).failed)):
             return self._follow(handle, order) or self._stopped(handle, order)
-        stands = f"the shape is reached; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
-        return self._follow(handle, order) or ("succeed", ErrorCode.OK, stands)
+        text = f"the shape is reached; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
+        return self._follow(handle, order) or ("succeed", ErrorCode.OK, text)
 
     def _follow(self, handle: WorkerGoal, order: Order) -> tuple[str, int, str] | None:
         """Wait until the shape of `order` is reached; returns None when it is."""

@@ -94,9 +94,9 @@ def test_a_command_that_is_not_confirmed_is_told_of_once(last: ActuatorState | N
 
 def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_nothing() -> None:
     driver = monitor(timeout=0.0)
-    assert driver.untaken(BEGAN + 0.9 * CONFIRM_S) is None
-    untaken = driver.untaken(BEGAN + 1.1 * CONFIRM_S)
-    assert untaken is not None and "no command has reached it" in str(untaken)
+    assert driver.unconfirmed(BEGAN + 0.9 * CONFIRM_S) is None
+    unconfirmed = driver.unconfirmed(BEGAN + 1.1 * CONFIRM_S)
+    assert unconfirmed is not None and "no command has reached it" in str(unconfirmed)
     driver = monitor(timeout=0.0)
     assert driver.order is not None and driver.order.command is not None
     driver.order.command.sent = Moment(10**9, 1.0, BEGAN + 1.0)  # no report has come since

@@ -79,7 +79,7 @@ def outcome_of(
         if hysteresis:
             undated = next(number for number, one in enumerate(measured, 1) if not one.stamp_ns)
             raise ValueError(
-                f"times: map {untold} has none, without which hysteresis cannot be separated from creep: give one in "
+                f"times: map {undated} has none, without which hysteresis cannot be separated from creep: give one in "
                 "s for each map"
             )
         last = time.time_ns()

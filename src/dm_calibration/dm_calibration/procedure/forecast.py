@@ -47,7 +47,7 @@ class Forecast:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
         source = ", median of mirrors drawn at random; one in ten errs by twice as much or more" if drawn else ""
-        reached = told_from(self.max_zernike, until if missed else 0.0)
+        reached = distinct_from(self.max_zernike, until if missed else 0.0)
         right = f"moves then accurate to {reached} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"
 
@@ -169,4 +169,4 @@ class GoodEnough:
         if found <= self._until:
             return f"{in_nanometres(self._until)} is reached: {in_nanometres(found)}{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{in_nanometres(self._until)} is not reached, but {told_from(found, self._until)}: {reason}{parts}"
+        return f"{in_nanometres(self._until)} is not reached, but {distinct_from(found, self._until)}: {reason}{parts}"

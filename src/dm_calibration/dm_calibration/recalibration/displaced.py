@@ -135,7 +135,7 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
     for actuator, (more, probability) in displaced.items():
         finding = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
         if silent[actuator]:
-            stands = "moves, but showed no response in the calibration"
+            finding = "moves, but showed no response in the calibration"
         elif given_up[actuator]:
             finding += ", moves again"
         else:

@@ -105,7 +105,7 @@ def certificate(
         reach, farthest = curvatures_text(low, high, 3), max((low, high), key=abs)
         within = "0.01 nm" if predicted < 1e-11 else length(predicted, calibration.wavelength)
         usual = f"largest coefficient error within {within} for half the spheres in the range"
-        foretold = f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends"
+        prediction = f"{usual}, up to {TOLERANCE * 1e9:.0f} nm at the ends"
     promise = (
         f"{bound}, 95 % bound on the largest coefficient error of an open-loop move, in addition to the predicted error"
     )
@@ -114,8 +114,8 @@ def certificate(
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach),
         ("promise", f"{promise} and to creep that no map has shown: each move states its own bound"),
-        ("predicted", foretold),
-        ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
+        ("predicted", prediction),
+        ("repeatable, absolute", accuracy_text(calibration.promise, calibration, farthest)),
         ("instrument's errors subtracted", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(round(until * 1e9))}: {reason}"),

@@ -152,9 +152,9 @@ def one_record(config: Config) -> Finding | None:
     folders = {node: effective(node, config.get(node, {}))["state_folder"] for node in nodes}
     if len(set(folders.values())) < 2:
         return None
-    told = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
+    listed = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
     return Finding(
-        f"state_folder differs ({told}): maps would be compared with another creep state", "give both nodes the same"
+        f"state_folder differs ({listed}): maps would be compared with another creep state", "give both nodes the same"
     )
 
 
