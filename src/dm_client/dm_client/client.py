@@ -114,7 +114,7 @@ class DeformableMirrorClient(Connection):
     # --- what is known ---
 
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
-        """The latest message on a topic that it subscribes. Raises DeformableMirrorError for others, or if none came."""
+        """The latest message on a subscribed topic. Raises DeformableMirrorError for others, or if none came."""
         if topic not in self._subscribed:
             text = (
                 f"{topic!r}: must be one of {', '.join(sorted(self._subscribed))}, or be subscribed first (subscribe)"
