@@ -116,9 +116,7 @@ class DeformableMirrorClient(Connection):
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
         """The latest message on a subscribed topic. Raises DeformableMirrorError for others, or if none came."""
         if topic not in self._subscribed:
-            text = (
-                f"{topic!r}: must be one of {', '.join(sorted(self._subscribed))}, or be subscribed first (subscribe)"
-            )
+            text = f"{topic!r}: must be one of {', '.join(sorted(self._subscribed))}, or one given to `subscribe`"
             raise DeformableMirrorError(ErrorCode.UNKNOWN_NAME, text)
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"no message on {topic}: are the nodes running (./dm up)?")
