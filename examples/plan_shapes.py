@@ -44,7 +44,7 @@ for curvature in np.linspace(0.8 * low, 0.8 * high, 5):
     now = time.time()
     move = planner.plan(FocusTarget(float(curvature)), state, now)
     state = law.move(state, send(move.signals), now)
-    print(f"{curvature:+.3f} 1/m: repeatable to {1e9 * move.plan.max_zernike_upper:.2f} nm (95 %)")
+    print(f"{curvature:+.3f} 1/m: coefficients within {1e9 * move.plan.max_zernike_upper:.2f} nm (95 %, by its maps)")
     for _ in range(3):  # hold it: the sooner after a move, the faster it creeps
         time.sleep(0.1)
         now = time.time()

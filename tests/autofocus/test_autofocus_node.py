@@ -420,7 +420,7 @@ def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer)
 @pytest.mark.parametrize(
     ("rate", "code", "text"),
     [
-        (4.0, ErrorCode.TIMEOUT, r"image_timeout = 0.1 s: .* one in 0.2\d* s; image_timeout must be above 0.5"),
+        (4.0, ErrorCode.TIMEOUT, r"image_timeout = 0.1 s: .* one image in 0.2\d* s; image_timeout must be above 0.5"),
         (1000.0, ErrorCode.OK, "sharpest at"),
     ],
 )

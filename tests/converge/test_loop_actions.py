@@ -119,7 +119,7 @@ def recipes(*curvatures: float, max_maps: int = 4, **fields: Any) -> BuildRecipe
         (converge(max_maps=1000), ErrorCode.OUT_OF_RANGE, "max_maps = 1000: must be"),
         (converge(200.0), ErrorCode.OUT_OF_RANGE, "must be below 1"),
         (recipes(0.01, float("nan")), ErrorCode.NOT_FINITE, "curvatures[1] = nan: must be a finite float"),
-        (recipes(0.01, 0.01), ErrorCode.INVALID_ARGUMENT, "+0.0100 1/m is there twice"),
+        (recipes(0.01, 0.01), ErrorCode.INVALID_ARGUMENT, "+0.0100 1/m is given twice"),
         (recipes(0.0, 5.0), ErrorCode.UNREACHABLE, "curvature = +5.0000 1/m"),
         (recipes(), ErrorCode.INVALID_LENGTH, "curvatures has 0 values: must have 1 to 1000"),
         (recipes(0.0, max_maps=3), ErrorCode.OUT_OF_RANGE, "max_maps = 3: must be int, 4 to 100"),

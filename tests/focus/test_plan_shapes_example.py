@@ -45,7 +45,7 @@ def test_the_example_focuses_a_mirror(
 
     monkeypatch.setattr(sys, "argv", ["plan_shapes.py", str(file)])
     used: dict[str, Any] = runpy.run_path(str(EXAMPLE))
-    assert capsys.readouterr().out.count("repeatable to") == 5
+    assert capsys.readouterr().out.count("by its maps") == 5
     # The mirror itself, from the signals that were sent: after all moves it has the last shape.
     state = law.degaussed(demagnetised, used["sent"][0][0], 0.0)
     for at, signals in used["sent"]:

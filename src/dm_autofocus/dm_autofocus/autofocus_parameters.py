@@ -36,7 +36,7 @@ PARAMETERS: Final = (
     Parameter(
         "image_transport",
         text("raw", choices=("raw", "compressed")),
-        "raw: images come on image_raw; compressed: as JPEG or PNG on image_raw/compressed.",
+        "raw: images come on image_raw; compressed: as JPEG, PNG or TIFF on image_raw/compressed.",
     ),
     Parameter("images_per_step", whole(1, 1, 100), "Images per position; their median sharpness counts."),
     Parameter("image_timeout", real(2.0, 0.01, 600.0, "s"), "Longest wait for an image that counts."),

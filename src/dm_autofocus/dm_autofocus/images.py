@@ -69,14 +69,14 @@ FORMATS = ("JPEG", "PNG", "TIFF")
 
 
 def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
-    """Pixels (height, width, ...) and encoding of the JPEG or PNG of a `sensor_msgs/CompressedImage`.
+    """Pixels (height, width, ...) and encoding of the JPEG, PNG or TIFF of a `sensor_msgs/CompressedImage`.
 
     Args:
         data: the file.
         image_format: as in the message; of "bayer_rggb8; jpeg compressed", the first part is used.
 
     Raises:
-        ValueError: it is no image that Pillow can read.
+        ValueError: it is no image of these formats, or damaged.
     """
     import PIL.Image  # imported here: needed for compressed images only
 
@@ -87,7 +87,7 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
             if decoded.mode == "I":
                 pixels = pixels.astype(np.uint16)
     except PIL.UnidentifiedImageError as error:  # its text has an address in memory
-        raise ValueError(f"an image of the format {image_format!r} that is neither JPEG nor PNG") from error
+        raise ValueError(f"an image of the format {image_format!r} that is not JPEG, PNG or TIFF") from error
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
         raise ValueError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
     mosaic = image_format.partition(";")[0].strip()

@@ -179,7 +179,7 @@ def test_compressed_images_give_their_pixels(kind: str, file: str, image_format:
         with pytest.raises(ValueError, match="cannot be decoded"):
             decompressed(written.getvalue()[:45], image_format)
         for broken in (b"", b"nothing", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"):
-            with pytest.raises(ValueError, match=r"is neither JPEG nor PNG$"):
+            with pytest.raises(ValueError, match=r"is not JPEG, PNG or TIFF$"):
                 decompressed(broken, image_format)
 
 

@@ -80,7 +80,7 @@ class Claim(TypedDict, total=False):
     """Options of every request that moves or holds the mirror, if somebody holds it (service `hold_mirror`).
 
     Attributes:
-        holder: who asks; requests of whoever holds the mirror are carried out.
+        holder: name of the client; requests of the client that holds the mirror are carried out.
         take_over: carry it out even if somebody else holds the mirror: they lose it, and their run ends.
     """
 

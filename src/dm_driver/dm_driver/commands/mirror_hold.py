@@ -30,7 +30,7 @@ TEXT = text("")
 
 
 class MirrorHold:
-    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s; `lock` keeps it as it is."""
+    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s; nobody is granted it while `lock` is held."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
