@@ -405,7 +405,7 @@ def test_two_cameras_on_one_topic_are_told(scene: FilmedScene, observer: Observe
     """Images of both count; the focus that is found is then of neither."""
     scene.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
     health = observer.record(DiagnosticArray, "/diagnostics", 10)
-    told = "2 nodes publish on /image_raw, and images of all count"
+    told = "/image_raw has 2 publishers, and images of all count"
     wait_until(lambda: any(told in item.status[0].message for item in health), 20, "it in the node's health")
     assert told in observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result.message
 

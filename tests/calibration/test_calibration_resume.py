@@ -180,7 +180,9 @@ def test_only_the_same_plan_settings_and_mirror_go_on(tmp_path: Path) -> None:
 
     first = begin()
     other = opened(tmp_path, POKES, settle=2)
-    assert not other.resumed and any("other settings: only the goal that began it resumes it" in note for note in other.notes)
+    assert not other.resumed and any(
+        "other settings: only the goal that began it resumes it" in note for note in other.notes
+    )
     assert begin().resumed == f"resumed run {first.journal.folder.name} with 3 maps"
     fresh = opened(tmp_path, POKES, fresh=True, settle=1)
     assert not fresh.resumed and any("3 maps) is set aside: a fresh run" in note for note in fresh.notes)

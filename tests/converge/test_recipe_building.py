@@ -213,7 +213,12 @@ def test_cancelling_stops_between_two_maps() -> None:
     [
         ((0.0, float("nan")), (), Refusal, r"curvature = nan: must be float, -1e\+06 to 1e\+06 1/m"),
         ((0.01, 0.02, 0.01), (), RecipeError, r"curvatures: \+0\.0100 1/m is given twice: must be given once"),
-        ((0.01, 0.01), 42 * (1e-8,), RecipeError, r"\+0\.0100 1/m with .*coma sin \+10 nm.* is given twice: must be given once"),
+        (
+            (0.01, 0.01),
+            42 * (1e-8,),
+            RecipeError,
+            r"\+0\.0100 1/m with .*coma sin \+10 nm.* is given twice: must be given once",
+        ),
         ((0.0, 5.0), (), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),
         ((0.0, 0.1), 20 * (0.0,), Refusal, "zernike has 20 values: must have 0 or 21 or 42"),
     ],

@@ -133,7 +133,7 @@ def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: A
     """
     focal_length = given_focal_length(values, camera_info)
     if not 0.0 < focal_length < math.inf:
-        reason = "came not yet" if camera_info is None else "holds no fx"
+        reason = "came not yet" if camera_info is None else "holds no finite fx"
         raise ValueError(f"optics.focal_length_px is 0, and camera_info {reason}")
     # Behind a relay that widens the beam m times, angles are m times smaller.
     return FocusLens(aperture_radius, values["optics.wavelength"], focal_length * values["optics.relay_magnification"])

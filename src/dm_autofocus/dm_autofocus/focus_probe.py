@@ -268,7 +268,7 @@ class FocusProbe:
     def doubled(self) -> str:
         """That several cameras send to this node, as a sentence; "" = they do not."""
         count = self._node.count_publishers(self.topic)
-        return f"{count} nodes publish on {self.topic}, and images of all count: one camera only" if count > 1 else ""
+        return f"{self.topic} has {count} publishers, and images of all count: one camera only" if count > 1 else ""
 
     def await_capabilities(self, timeout_s: float, check: Callable[[], None]) -> None:
         """Wait for the first capabilities, at most `timeout_s`. Raises what `check` raises meanwhile."""

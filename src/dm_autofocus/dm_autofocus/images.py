@@ -221,7 +221,7 @@ class SettledGate:
         """
         if newest is not None and newest - self._stamp_lead > now + self._ahead:
             ahead = newest - self._stamp_lead - now
-            return f"the newest is stamped {ahead:.3f} s ahead of this node's clock; do the clocks agree?"
+            return f"the newest seems exposed {ahead:.3f} s ahead of this node's clock; do the clocks agree?"
         if 2 * apart > timeout_s:  # one period may pass until an exposure begins, and another until it has arrived
             return f"the camera takes one image in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
         if newest is None:

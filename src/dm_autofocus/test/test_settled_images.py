@@ -81,8 +81,8 @@ def test_images_stamped_ahead_of_the_time_never_count() -> None:
     assert simulated.open_for(100.4, now=100.2) and not gate.open_for(100.4, now=100.2)
     assert corrected.open_for(100.4, now=100.2), "stamp_lead tells by how much that clock is ahead"
     assert gate.open_for(100.21, now=100.2)
-    assert "stamped 0.200 s ahead of this node's clock" in gate.reason(100.4, 0.03, 2.0, now=100.2)
-    assert "stamped 2.800 s ahead of this node's clock" in simulated.reason(103.0, 3.0, 2.0, now=100.2)
+    assert "exposed 0.200 s ahead of this node's clock" in gate.reason(100.4, 0.03, 2.0, now=100.2)
+    assert "exposed 2.800 s ahead of this node's clock" in simulated.reason(103.0, 3.0, 2.0, now=100.2)
 
 
 def test_a_camera_that_stopped_is_not_told_to_set_its_clock() -> None:

@@ -19,7 +19,7 @@ from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
 from dm_calibration.influence.screening import LAW_ERRORS
 from dm_calibration.procedure.outcome import Outcome
-from dm_calibration.recalibration.not_followed import not_followed
+from dm_calibration.recalibration.not_followed import NOT_FOLLOWED, not_followed
 from dm_calibration.store.calibration_store import new_id
 from dm_common import Floats
 from dm_common.mirror import Mirror
@@ -220,13 +220,15 @@ def refit(
     of_the_run = [
         sentence
         for sentence in stored.limitations
-        if sentence not in stored.fit.limitations and not sentence.startswith(POKE_CHECK)
+        if sentence not in stored.fit.limitations
+        and not sentence.startswith(POKE_CHECK)
+        and NOT_FOLLOWED not in sentence
     ]
     poked = _poke_sentences(check_fit(fit, mirror))  # a map left out may have been the cause of a finding
     without = f" without {', '.join(exclude)}" if exclude else ""
     if exclude and stored.hysteresis is not None:
         without += "; the hysteresis model and the promise are still those of all maps"
-    return replace(
+    made = replace(
         stored,
         id=provenance.id,
         created_ns=provenance.created_ns,
@@ -236,3 +238,4 @@ def refit(
         note=provenance.note or stored.note,
         software_version=software_version(),
     )
+    return replace(made, limitations=(*made.limitations, *not_followed(made)))

@@ -23,6 +23,11 @@ def storing(failure: str) -> Iterator[None]:
         raise StoreError(f"{failure}: {error.strerror or error}") from error
 
 
+def is_stream(path: Path) -> bool:
+    """Whether `path` is a device, a pipe or an open file (/dev/stdout): it is written to, never read or replaced."""
+    return path.parent in (Path("/dev"), Path("/dev/fd")) or (path.exists() and not path.is_file())
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to a temporary file and rename that to `path` in one step; the folder is created if needed.
 
@@ -31,8 +36,9 @@ def write_whole(path: Path, content: bytes) -> None:
     Raises:
         OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
     """
-    if path.exists() and not path.is_file():
-        path.write_bytes(content)
+    if is_stream(path):
+        with path.open("ab") as stream:
+            stream.write(content)
         return
     path = Path(os.path.realpath(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")

@@ -57,3 +57,11 @@ def test_a_pipe_is_written_to_and_not_replaced_by_a_file(tmp_path: Path) -> None
     write_whole(pipe, b"figures")
     assert pipe.is_fifo() and os.read(reader, 100) == b"figures"
     os.close(reader)
+
+
+def test_what_others_have_open_is_written_to(tmp_path: Path) -> None:
+    """As /dev/stdout is, where it leads to a file: what was printed before stays."""
+    with (tmp_path / "log").open("wb", buffering=0) as log:
+        log.write(b"printed\n")
+        write_whole(Path(f"/dev/fd/{log.fileno()}"), b"figures\n")
+    assert (tmp_path / "log").read_bytes() == b"printed\nfigures\n"

@@ -130,7 +130,7 @@ def reached_so_far(feedback: Any) -> str:
     if not feedback.expected_max_zernike > 0.0:
         time = f"{feedback.time_left:.0f} s"
         return (
-            f"{text}, the hysteresis law is hardly found yet and will reduce this, {feedback.maps_left} more maps at "
+            f"{text}, the hysteresis law is hardly found yet, then the error falls, {feedback.maps_left} more maps at "
             f"most ({time})"
         )
     expected = in_nanometres(feedback.expected_max_zernike)

@@ -156,10 +156,7 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    if path.is_relative_to("/dev"):  # may be a file that somebody has open
-        path.write_text(text)
-    else:
-        write_whole(path, text.encode())
+    write_whole(path, text.encode())
     console.print(f"figures: {path}")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from dm_bringup.config_edit import edited, values_of
 from dm_bringup.sections import ConfigError
 from dm_bringup.suite import load_config
-from dm_common.atomic_write import write_whole
+from dm_common.atomic_write import is_stream, write_whole
 from dm_common.errors import ErrorCode
 from dm_tools.output import console
 from dm_tools.verbs.up import CAMERA, shared_config
@@ -60,7 +60,7 @@ def source_of(target: Path, config: Path | None, serial: str, namespace: str = "
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
     """
-    source = config or (target if target.is_file() else shared_config("bench.yaml"))
+    source = config or (target if target.is_file() and not is_stream(target) else shared_config("bench.yaml"))
     written = str(load_config(source, namespace.strip("/")).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
         raise ConfigError(
@@ -96,7 +96,7 @@ def write_parameters(
 
 def keep_before(target: Path) -> None:
     """Copy an existing file at `target` beside it under a free name. Raises OSError."""
-    if target.is_file():
+    if target.is_file() and not is_stream(target):
         kept = (target.with_name(f"{target.name}.before{number}") for number in chain([""], count(2)))
         before = next(path for path in kept if not path.exists())
         write_whole(before, target.read_bytes())

@@ -26,8 +26,8 @@ CREPT_MAX = 1.5
 #: actuator predict requests. With 53 beyond it, only 40 to 50 % of the requests to three mirrors were inside their
 #: bounds, and 90 % within 2.1 to 2.9 times the bound; so with fewer maps the bound is raised by a fourth power.
 MAPS_BEYOND, FEWER = 75, 4
-#: A test move counts as held if its map is older than HELD_AGE times the median; fewest held moves that count.
-HELD_AGE, HELD_MIN = 2.0, 4
+#: A test move counts as held if its map comes this much later after it than the median, s; fewest that count.
+HELD_S, HELD_MIN = 0.9, 4
 #: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
 
@@ -121,8 +121,8 @@ def _held(found: Identification, maps: MapSet) -> float:
     """
     error = np.square(found.held_out[:, : maps.terms - PISTON_TILT]).sum(axis=1)
     seen, age = np.isfinite(error), 1e-9 * (maps.stamp_ns - maps.stamp_ns[0]) - maps.moved_s()
-    held = seen & (age > HELD_AGE * np.median(age[seen]))
-    if held.sum() < HELD_MIN or held.sum() == seen.sum():
+    held = seen & (age > np.median(age[seen]) + HELD_S) if seen.any() else seen
+    if held.sum() < HELD_MIN:
         return 1.0
     return max(1.0, float(np.sqrt(error[held].mean() / error[seen & ~held].mean())))
 

@@ -46,7 +46,11 @@ class Forecast:
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
-        source = ", median of mirrors drawn at random; one in ten errs by twice as much or more" if drawn else ""
+        source = (
+            ", median of mirrors drawn at random; one in ten errs twice as much, other kinds of mirrors more"
+            if drawn
+            else ""
+        )
         reached = distinct_from(self.max_zernike, until if missed else 0.0)
         right = f"moves then accurate to {reached} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"

@@ -93,7 +93,7 @@ def pitch_of_sphere(
     if radius_of_curvature == 0.0 or not seen * radius_of_curvature > 0.0:
         raise ValueError(
             f"radius of curvature = {radius_of_curvature:g} m: must have the sign of the map's defocus, "
-            f"{seen * 1e9:+.1f} nm"
+            f"{seen * 1e9:+.1f} nm, and the map must show one"
         )
     found = 2.0 * np.sqrt(seen * radius_of_curvature) / radius_px
     for _ in range(3):  # a sphere is a little steeper than the paraboloid of its curvature

@@ -30,7 +30,7 @@ TEXT = text("")
 
 
 class MirrorHold:
-    """The hold of one mirror; may be used from any thread. `clock` gives steady time, s; nobody is granted it while `lock` is held."""
+    """The hold of one mirror, for threads. `clock` gives steady time, s; while `lock` is held nobody is granted it."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock

@@ -14,7 +14,7 @@ from dm_bringup.nodes import NODES
 from dm_tools.running_suite import BUSY_S, NEEDED, latest_message, nodes_of_suite, where
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
-#: Least free space in /dev/shm, B: virtual bench, autofocus and every program take 16 MB each (config/fastdds.xml).
+#: Least free space in /dev/shm, B: virtual bench, autofocus and every program take 17 MB each (config/fastdds.xml).
 SHARED_MEMORY_MIN = 60e6
 DISK_MIN = 1e9
 #: What the suite keeps in ~/.ros unless configured otherwise.
