@@ -87,7 +87,7 @@ PLAIN = frozenset(
         "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min needs newest none now "
         "present again doctor have long ok own pdf ready real running said several sheets since soon start status "
         "taken terminal config there things took typical "
-        "valid whole write writes written yaml yet",
+        "other valid whole write writes written yaml yet",
     )
 )
 #: Endings of a word, and what its stem has instead.
