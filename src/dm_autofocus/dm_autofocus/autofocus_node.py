@@ -152,7 +152,7 @@ class AutofocusNode(ManagedNode):
             elif time.monotonic() - since > limit:
                 text = f"no image on {self._probe.topic} within image_timeout = {limit:g} s: is the camera running?"
                 raise Refusal(ErrorCode.TIMEOUT, text)
-            if problem := self._probe.doubled() or self._image_problem:
+            if problem := self._probe.several_cameras() or self._image_problem:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, problem)
         except Refusal as error:
             return Health(WARN, str(error), values)

@@ -265,8 +265,8 @@ class FocusProbe:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
         return SharpnessSample(sharpness, image, (part,))
 
-    def doubled(self) -> str:
-        """That several cameras send to this node, as a sentence; "" = they do not."""
+    def several_cameras(self) -> str:
+        """A sentence if the topic of the images has several publishers; "" = it has not."""
         count = self._node.count_publishers(self.topic)
         return f"{self.topic} has {count} publishers, and images of all count: one camera only" if count > 1 else ""
 

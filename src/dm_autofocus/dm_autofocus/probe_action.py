@@ -133,7 +133,7 @@ class ProbeAction(ABC):
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
             outcome = "canceled" if result.error_code == ErrorCode.CANCELED else "abort"
-        if doubled := self._probe.doubled():
-            result.message += f"; {doubled}"
+        if problem := self._probe.several_cameras():
+            result.message += f"; {problem}"
         result.duration = time.monotonic() - started
         return outcome, result

@@ -23,7 +23,7 @@ from dm_calibration.procedure.resumable_run import OpenRun, identity_of, mirror_
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.worker import WorkerGoal, lasting, wait_for_clock
+from dm_common.ros.worker import WorkerGoal, duration_clock, wait_for_clock
 from dm_common.values import fill_with_nan
 
 _OF_HYSTERESIS = (StepKind.EXCITATION, StepKind.IN_USE, StepKind.CHECK, StepKind.DEGAUSSED)
@@ -53,7 +53,7 @@ class CalibrateAction:
     def run(self) -> tuple[str, Calibrate.Result]:
         """Carry out the goal; return its outcome (succeed, abort or canceled) and the result."""
         goal, result = self._goal, self._result
-        clock = lasting(self._node.get_clock())
+        clock = duration_clock(self._node.get_clock())
         started = clock.now()
         try:
             self._mirror = self._manager.known_mirror(wait_s=START_GRACE_S)

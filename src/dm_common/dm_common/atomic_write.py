@@ -25,7 +25,9 @@ def storing(failure: str) -> Iterator[None]:
 
 def is_stream(path: Path) -> bool:
     """Whether `path` is a device, a pipe or an open file (/dev/stdout): it is written to, never read or replaced."""
-    return path.parent in (Path("/dev"), Path("/dev/fd")) or (path.exists() and not path.is_file())
+    return path.parent in (Path("/dev"), Path("/dev/fd")) or (
+        path.exists() and not path.is_file() and not path.is_dir()
+    )
 
 
 def write_whole(path: Path, content: bytes) -> None:

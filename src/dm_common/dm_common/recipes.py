@@ -132,7 +132,7 @@ def terms_of(text: str) -> list[float]:
     Raises:
         ValueError: an unknown or repeated term, or a value that is not a number; the message names it.
     """
-    from dm_common.figures import with_point  # only commands ask
+    from dm_common.figures import with_point  # only commands and console parse text
 
     terms: dict[str, float] = {}
     for part in text.split(","):

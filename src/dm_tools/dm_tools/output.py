@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from dm_common.atomic_write import write_whole
+from dm_common.atomic_write import is_stream, write_whole
 from dm_common.figures import in_wavelengths
 
 #: Square brackets that are no markup of these commands, and the backslashes before them.
@@ -43,13 +43,13 @@ WAVELENGTH = 632.8e-9
 
 def output_file(path: Path | None) -> Path | None:
     """`path`, if a file can be written there: a long run must not fail at its end. Raises typer.BadParameter."""
-    if path is None or path == STANDARD_OUTPUT or path.is_relative_to("/dev"):
+    if path is None or path == STANDARD_OUTPUT:
         return path
     free = False
     with suppress(PermissionError):  # below a folder that cannot be searched
         nearest = next(folder for folder in path.absolute().parents if folder.exists())  # missing ones are created
         inside = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
-        free = path.is_fifo() or (inside and not path.is_dir())
+        free = is_stream(path) or (inside and not path.is_dir())
     if not free:
         raise typer.BadParameter(f"{path}: must be a file, in a folder in which one can be written")
     return path

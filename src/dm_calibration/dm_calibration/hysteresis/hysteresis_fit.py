@@ -27,7 +27,7 @@ CREPT_MAX = 1.5
 #: bounds, and 90 % within 2.1 to 2.9 times the bound; so with fewer maps the bound is raised by a fourth power.
 MAPS_BEYOND, FEWER = 75, 4
 #: A test move counts as held if its map comes this much later after it than the median, s; fewest that count.
-HELD_S, HELD_MIN = 0.9, 4
+HELD_LONGER_S, HELD_MIN = 0.9, 4
 #: Random draws for the quantile of the largest of several correlated errors.
 DRAWS = 4000
 
@@ -121,7 +121,7 @@ def _held(found: Identification, maps: MapSet) -> float:
     """
     error = np.square(found.held_out[:, : maps.terms - PISTON_TILT]).sum(axis=1)
     seen, age = np.isfinite(error), 1e-9 * (maps.stamp_ns - maps.stamp_ns[0]) - maps.moved_s()
-    held = seen & (age > np.median(age[seen]) + HELD_S) if seen.any() else seen
+    held = seen & (age > np.median(age[seen]) + HELD_LONGER_S)
     if held.sum() < HELD_MIN:
         return 1.0
     return max(1.0, float(np.sqrt(error[held].mean() / error[seen & ~held].mean())))

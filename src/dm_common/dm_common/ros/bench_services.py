@@ -24,7 +24,7 @@ from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call, run_goal
-from dm_common.ros.worker import lasting, sleep
+from dm_common.ros.worker import duration_clock, sleep
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
@@ -184,7 +184,7 @@ class BenchServices:
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
-        clock = lasting(self._node.get_clock())
+        clock = duration_clock(self._node.get_clock())
         began = clock.now()
         # The interferometer enforces the time limit; the call waits a little longer for its answer with the reason.
         try:

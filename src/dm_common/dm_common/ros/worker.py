@@ -271,7 +271,7 @@ def wait_for_clock(clock: Clock) -> None:
         time.sleep(0.01)
 
 
-def lasting(clock: Clock) -> Clock:
+def duration_clock(clock: Clock) -> Clock:
     """The clock that durations are taken by: `clock` if it is simulated, else a steady one: system time may be set."""
     return clock if clock.ros_time_is_active else Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -283,7 +283,7 @@ def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: 
     has ended) for 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
-    ticking = lasting(clock)
+    ticking = duration_clock(clock)
     end = ticking.now() + (whole := Duration(nanoseconds=round(seconds * 1e9)))
     give_up = time.monotonic() + 10.0 + 10.0 * seconds
     while (remaining := (end - ticking.now()).nanoseconds * 1e-9) > 0:

@@ -30,7 +30,7 @@ TEXT = text("")
 
 
 class MirrorHold:
-    """The hold of one mirror, for threads. `clock` gives steady time, s; while `lock` is held nobody is granted it."""
+    """The hold of one mirror, thread-safe. `clock` gives steady time, s; while `lock` is held no hold changes."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
