@@ -146,7 +146,7 @@ class FilmedScene:
 
     def _judge(self, request: FocusRequest) -> FocusState:
         state = FocusState(curvature=request.curvature, signals=[request.curvature] * 3)
-        state.conic_constant = request.conic_constant
+        state.conic_constant, state.zernike = request.conic_constant, request.zernike
         state.applied = abs(request.curvature) <= self.refuse_beyond
         state.history_known = self.history_known
         state.curvature_min, state.curvature_max = -self.refuse_beyond, self.refuse_beyond

@@ -85,6 +85,8 @@ def test_dry_run_and_refusals_move_nothing(bench: Bench) -> None:
     assert "curvature = nan" in not_a_number.message
     two_terms = bench.set_focus(curvature=0.0, zernike=[1e-9, 2e-9])
     assert two_terms.error_code == ErrorCode.INVALID_LENGTH
+    terms = [0.0] * 4 + [1e-9] + [0.0] * 16
+    assert list(bench.set_focus(curvature=0.0, zernike=terms, dry_run=True).state.zernike) == terms
     recipe = bench.set_focus(curvature=0.0, mode=FocusRequest.MODE_CONDITIONED)
     assert recipe.error_code == ErrorCode.NOT_SUPPORTED
     assert bench.set_focus(curvature=0.0, mode="77").error_code == ErrorCode.UNKNOWN_NAME

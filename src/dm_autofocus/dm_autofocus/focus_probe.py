@@ -53,7 +53,7 @@ class FocusProbe:
     Attributes:
         controller: whether the focus controller is present.
         capabilities: the latest of the controller; None before the first.
-        shape: the last that the driver took: curvature [1/m] (NaN = none yet), conic constant, terms [m] if known.
+        shape: the last that the driver took: curvature [1/m] (NaN = none yet), conic constant, terms [m].
         user: action that holds the mirror; "" = none does.
         target: curvature that `move` requested last [1/m]; NaN while nobody holds the mirror.
         topic: of the images.
@@ -70,7 +70,6 @@ class FocusProbe:
         self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
         self.shape: tuple[float, float, Sequence[float]] = (math.nan, 0.0, ())
-        self._latest_request = FocusRequest()  # the latest on focus_request
         self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
@@ -90,7 +89,6 @@ class FocusProbe:
         self._node, self.topic = node, ""
         self._images: Any = None
         node.create_subscription(CameraInfo, "camera_info", partial(setattr, self, "camera_info"), IMAGES)
-        node.create_subscription(FocusRequest, "focus_request", partial(setattr, self, "_latest_request"), qos.COMMAND)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         node.create_subscription(Capabilities, "capabilities", partial(setattr, self, "capabilities"), qos.LATCHED)
@@ -124,10 +122,7 @@ class FocusProbe:
     def _on_focus_state(self, message: FocusState) -> None:
         with self._changed:
             if message.applied:
-                shape, request = (message.curvature, message.conic_constant), self._latest_request
-                answered = (request.curvature, request.conic_constant) == shape
-                self.shape = (*shape, request.zernike if answered else ())
-                self._latest_request = FocusRequest() if answered else request
+                self.shape = (message.curvature, message.conic_constant, message.zernike)
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:

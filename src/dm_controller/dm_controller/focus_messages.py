@@ -32,7 +32,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
     request, move, active, refusal = order.request, order.move, order.active, order.refusal
     state = fill_with_nan(FocusState()) if move is None else FocusState()
     state.curvature, state.power = request.curvature, 2 * request.curvature
-    state.conic_constant = request.conic_constant
+    state.conic_constant, state.zernike = request.conic_constant, request.zernike
     state.mode, state.applied = request.mode, order.applied
     state.header.stamp = time_message(order.began.ns)
     if move is not None and active is not None:

@@ -103,7 +103,7 @@ _DECLARED = (
             *("focus_stack/camera_info", "focus_stack/depth", "focus_stack/image"),
         ),
         subscribe=(
-            *("actuator_state", "capabilities", "focus_request", "focus_state"),
+            *("actuator_state", "capabilities", "focus_state"),
             *("camera_info", "image_raw", "image_raw/compressed"),
         ),
         reply=("get_focus_range", "set_focus_distance"),
