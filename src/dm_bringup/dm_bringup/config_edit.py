@@ -50,9 +50,11 @@ def _with_value(text: str, key: str, name: str, value: Any) -> str:
     for parameter, old in section.value:
         if parameter.value == name:
             start, end = old.start_mark, len(text[: old.end_mark.index].rstrip())  # a block of text ends a line below
-            if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # keep one item per line
+            if isinstance(old, yaml.SequenceNode) and not old.flow_style:
                 end = old.value[-1].end_mark.index
-                literal = f"\n{' ' * start.column}".join(f"- {_literal(item)}" for item in value)
+                items = value if isinstance(value, list | tuple) else ()
+                # A list keeps one item per line; anything else is indented further than its name.
+                literal = f"\n{' ' * start.column}".join(f"- {_literal(item)}" for item in items) or f"  {literal}"
             return text[: start.index] + literal + text[end:]
     if section.flow_style or not section.value:
         begin = section.start_mark.index + 1

@@ -121,6 +121,13 @@ def test_texts_stay_texts(value: Any) -> None:
     assert found == value and type(found) is type(value)
 
 
+@pytest.mark.parametrize("value", [0.5, "abc", []])
+def test_a_list_in_lines_may_become_another_value(value: Any) -> None:
+    text = "/**/pdm_driver:\n  ros__parameters:\n    a:\n    - 1\n    - 2  # the last\n    # that is all\n    b: 1\n"
+    after = edited(text, {"pdm_driver": {"a": value}})
+    assert sections(after)["/**/pdm_driver"] == {"a": value, "b": 1} and "# that is all" in after
+
+
 def test_what_is_no_parameter_file_is_refused() -> None:
     for text in ("a: [", "- 1\n- 2\n", "/**/pdm_driver: 7\n"):
         with pytest.raises(ConfigError):

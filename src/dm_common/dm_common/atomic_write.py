@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, even if the power fails meanwhile."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -33,7 +34,8 @@ def is_stream(path: Path) -> bool:
 def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to a temporary file and rename that to `path` in one step; the folder is created if needed.
 
-    A link at `path` stays: what it leads to is replaced. A device or a pipe is written to, and not replaced by a file.
+    A link at `path` stays: what it leads to is replaced. The permissions of a file stay. A device or a pipe is written
+    to, and not replaced by a file.
 
     Raises:
         OSError: disk full, read-only, ...; the previous file at `path` is then unchanged.
@@ -51,6 +53,8 @@ def write_whole(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        with suppress(OSError):  # a new file; some file systems know no permissions
+            shutil.copymode(path, temporary)
         temporary.replace(path)
     except OSError:
         with suppress(OSError):

@@ -1,6 +1,7 @@
 """Where nodes keep their state."""
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,10 @@ def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None
     for content in (b"first", b"second"):
         write_whole(link, content)
         assert link.is_symlink() and file.read_bytes() == content
+        file.chmod(0o660)
     assert sorted(tmp_path.rglob("*")) == [link, file.parent, file]
+    write_whole(file, b"third")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o660
 
 
 def test_a_pipe_is_written_to_and_not_replaced_by_a_file(tmp_path: Path) -> None:
