@@ -1,6 +1,6 @@
 """Pictures of the camera's demonstration: a contact sheet and an animation."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,60 +99,52 @@ def save_animation(
         cursor.set_xdata([shot.curvature, shot.curvature])
         left.set_title(text, color=colour, fontsize=9)
 
-    def search(number: int, shown: int) -> None:
-        item, colour = found[number], COLOURS[number % len(COLOURS)]
-        done = shown >= len(item.shots)
-        past = item.shots[: shown + 1]
-        clouds[number].set_data([s.curvature for s in past], [s.sharpness for s in past])
-        text = f"{item.distance:g} m: image {shown + 1}"
-        if done:
-            text = f"{item.distance:g} m: found {item.result.distance:.2f} m, {len(item.shots)} images"
-        show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
-
-    def show_sweep(shown: int) -> None:
-        for line in cross:
-            line.set_visible(True)
-        show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
-
-    def everything(_shown: int) -> None:
-        for line in cross:
-            line.set_visible(False)
-        picture.set_data(sweep.sharp)
-        depth.set(visible=True)
-        right.set_axis_off()
-        text = f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s"
-        left.set_title(text, color="black", fontsize=9)
-
-    def track(shown: int) -> None:
-        depth.set(visible=False)
-        right.set_axis_on()
-        text = f"4  Tracking: the object comes nearer, {approach.distances[shown]:.1f} m"
-        show(approach.shots[shown], text, COLOURS[0], found[0].region)
-
-    # A row is (what to draw, its arguments, for how many frames it stays).
-    schedule: list[tuple[Callable[..., None], tuple[int, ...], int]] = []
-    for number, item in enumerate(found):
-        schedule += [(search, (number, shown), 1) for shown in range(len(item.shots))]
-        schedule += [(search, (number, len(item.shots)), HOLD)]
-    schedule += [(show_sweep, (shown,), 1) for shown in range(len(sweep.shots))]
-    schedule += [(everything, (0,), 2 * HOLD)]
-    schedule += [(track, (shown,), 1) for shown in range(len(approach.shots))]
-    schedule += [(track, (len(approach.shots) - 1,), HOLD)] if approach.shots else []
-
     canvas = FigureCanvasAgg(figure)
-    images = []
-    for draw, arguments, _ in schedule:
-        draw(*arguments)
+    images: list[Image.Image] = []
+    stays: list[int] = []  # for how many frames each image stays
+
+    def take(frames: int = 1) -> None:
         canvas.draw()
         figure.set_layout_engine("none")  # else every frame is laid out anew
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    durations = [1000 * frames // frames_per_second for _, _, frames in schedule]
+        stays.append(frames)
+
+    for item, colour, cloud in zip(found, COLOURS, clouds, strict=False):
+        few = f"1  Few images. {item.distance:g} m:"
+        for number, shot in enumerate(item.shots, start=1):
+            past = item.shots[:number]
+            cloud.set_data([s.curvature for s in past], [s.sharpness for s in past])
+            show(shot, f"{few} image {number}", colour, item.region)
+            take()
+        show(item.final, f"{few} found {item.result.distance:.2f} m, {len(item.shots)} images", colour, item.region)
+        take(HOLD)
+    for line in cross:
+        line.set_visible(True)
+    for shot in sweep.shots:
+        show(shot, "2  The picture stands still while the focus sweeps", "black")
+        take()
+    for line in cross:
+        line.set_visible(False)
+    picture.set_data(sweep.sharp)
+    depth.set(visible=True)
+    right.set_axis_off()
+    text = f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s"
+    left.set_title(text, color="black", fontsize=9)
+    take(2 * HOLD)
+    depth.set(visible=False)
+    right.set_axis_on()
+    for shot, distance in zip(approach.shots, approach.distances, strict=True):
+        show(shot, f"4  Tracking: the object comes nearer, {distance:.1f} m", COLOURS[0], found[0].region)
+        take()
+    if approach.shots:
+        take(HOLD)
     # One palette for all frames: the colours of those on which the animation rests, and greys for the pictures.
-    held_images = [image for image, (_, _, frames) in zip(images, schedule, strict=True) if frames > 1]
+    held_images = [image for image, frames in zip(images, stays, strict=True) if frames > 1]
     sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in held_images]))
     palette = sheet.quantize(PALETTE, Image.Quantize.MAXCOVERAGE)
     greys = np.repeat(np.linspace(0, 255, GREYS).astype(int), 3)
     palette.putpalette([*(palette.getpalette() or ())[: 3 * PALETTE], *greys.tolist()])
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    durations = [1000 * frames // frames_per_second for frames in stays]
     first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
     return path
