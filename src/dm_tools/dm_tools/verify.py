@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_autofocus.images import pixels_of
+from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_common import Floats
+from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.target import FocusTarget
 
@@ -42,17 +44,10 @@ def surface_error(sag: NDArray[np.floating[Any]], info: Any, target: FocusTarget
     """
     if not info.aperture_radius > 0:
         raise ValueError("the map has no lateral resolution: set the interferometer's parameter `pitch`")
-    x = (np.arange(sag.shape[1]) - info.centre_x) / info.aperture_radius_px
-    y = (info.centre_y - np.arange(sag.shape[0])) / info.aperture_radius_px
-    grid_x, grid_y = np.meshgrid(x, y)
-    inside = grid_x**2 + grid_y**2 <= 1.0
-    error = np.where(inside, sag - target.sag(grid_x, grid_y, info.aperture_radius), np.nan)
+    aperture = Aperture(info.centre_x, info.centre_y, info.aperture_radius_px)
+    place = aperture.places(*np.indices(sag.shape))
+    wanted = target.sag(place.real, place.imag, info.aperture_radius)
+    error = np.where(aperture.disc(sag.shape), sag - wanted, np.nan)
     fit = MapFitter(np.isfinite(error), info.centre_x, info.centre_y, info.aperture_radius_px).fit(error)
-    # The first three terms are piston and the tilts, in x and y.
-    residual = error - (fit.coefficients[0] + fit.coefficients[1] * grid_x + fit.coefficients[2] * grid_y)
-    residual -= np.nanmean(residual)
-    return SurfaceError(
-        residual=residual,
-        rms=float(np.sqrt(np.nanmean(residual**2))),
-        max_zernike=float(np.abs(fit.coefficients[PISTON_TILT:]).max()),
-    )
+    residual = remove_plane(error)
+    return SurfaceError(residual, float(np.nanstd(residual)), float(np.abs(fit.coefficients[PISTON_TILT:]).max()))

@@ -86,28 +86,22 @@ def check(
     )
     names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
     write_json(json, {"check": figures(response, *names) | {"promised_nm": 1e9 * promised}})
-    if not (response.accepted or forget):
+    outside = not (forget or without or kept(promised, response.max_zernike))
+    if failed := not (response.accepted or forget):
         cure = "as the message says, or ./dm calibrate" if "./dm check --" in response.message else "./dm calibrate"
-        next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}", namespace)
+        then = f"./dm degauss and ./dm check again; if it still disagrees, {cure}"
+    elif outside:
+        then = "one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate"
+    elif without and dry_run:
+        then = "the same command without --dry-run continues so; nothing is changed yet"
+    elif without:
+        then = "ask for the shape again: the present command still relies on all actuators; ./dm status shows the range"
+    elif lost and not forget:
+        then = "./dm degauss: then focus_controller knows the history too"
+    elif calibration.hysteresis.play_radius:
+        then = "./dm report writes what the calibration holds"
+    else:
+        then = "./dm calibrate finds the hysteresis too; its error bound is far smaller than this"
+    next_step(then, namespace)
+    if failed or outside:
         raise typer.Exit(1)
-    if not (forget or without or kept(promised, response.max_zernike)):
-        again = "one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate"
-        next_step(again, namespace)
-        raise typer.Exit(1)
-    if without:
-        again = (
-            "ask for the shape again: the present command still relies on all actuators; ./dm status shows the range"
-        )
-        next_step(
-            "the same command without --dry-run continues so; nothing is changed yet" if dry_run else again, namespace
-        )
-        return
-    if lost and not forget:
-        next_step("./dm degauss: then focus_controller knows the history too", namespace)
-        return
-    next_step(
-        "./dm report writes what the calibration holds"
-        if calibration.hysteresis.play_radius
-        else "./dm calibrate finds the hysteresis too; its error bound is far smaller than this",
-        namespace,
-    )

@@ -185,9 +185,7 @@ def first_command(capabilities: Any, file: Path | None) -> str:
     """First command for a suite that `file` configures; None = the shipped virtual bench, whose wiring is correct."""
     if capabilities.calibration_id:
         return "degauss" if unknown_history(capabilities) else "focus 0.02"
-    if calibration_refused(capabilities):
-        return "calibrate"
-    if file is None:
+    if file is None or calibration_refused(capabilities):
         return "calibrate"
     return f"calibrate --plan poke-check --config {quote(str(file))} --write found.yaml"
 
