@@ -18,7 +18,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch
-from dm_common.optics.piston_tilt import remove_piston_tilt, rms
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms, weighted_fit
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import basis
 
@@ -120,19 +120,13 @@ def bumps(places: Places, width: float, points: SamplePoints, terms: Floats | No
     """
     distance = np.abs(places[:, None] - (points.x + 1j * points.y))
     sag = np.exp(-0.5 * np.square(distance / width))
-    return unit_responses(sag if terms is None else _within(sag, points, terms), points)
-
-
-def _within(sag: Floats, points: SamplePoints, terms: Floats) -> Floats:
-    """The part of `sag` (N, P) that consists of `terms`."""
-    root = np.sqrt(points.weight)[:, None]
-    return np.asarray((terms @ np.linalg.lstsq(root * terms, root * sag.T, rcond=None)[0]).T)
+    return unit_responses(sag if terms is None else weighted_fit(sag, terms, points.weight) @ terms.T, points)
 
 
 def only_terms(unit: Floats, points: SamplePoints) -> Floats | None:
     """(P, 21) Zernike terms if the responses (A, P) contain nothing else, as those of a sensor; None = they do."""
     terms = basis(points.x, points.y)
-    left = rms(unit - _within(unit, points, terms), points.weight)
+    left = rms(unit - weighted_fit(unit, terms, points.weight) @ terms.T, points.weight)
     return terms if np.max(left) < ONLY_TERMS else None
 
 

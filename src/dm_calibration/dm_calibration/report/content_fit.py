@@ -6,13 +6,13 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import effective_maps
+from dm_calibration.hysteresis.run import basis_of, without
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.influence.regression import make_design
 from dm_calibration.report import figures
 from dm_calibration.report.content import NM
 from dm_calibration.report.document import Picture, Section, Table
-from dm_common import Floats
 from dm_common.geometry import rings
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, regional_rms
@@ -34,16 +34,12 @@ def residuals(calibration: Calibration) -> MapSet:
         maps = effective_maps(maps, calibration.hysteresis.law)
     used = maps.select(fit.used)
     design = make_design(used)
-    drift = design.matrix[:, : design.drift]
-
-    def less_drift(values: Floats) -> Floats:
-        return np.asarray(values - drift @ np.linalg.lstsq(drift, values, rcond=None)[0])
-
+    drift = basis_of(design.matrix[:, : design.drift])
     predicted = used.applied @ fit.influence_sag.T + fit.sag_offset
     sag = fill_gaps(remove_piston_tilt(used.sag, used.points), predicted, used.points) - predicted
     sag = np.where(np.isfinite(used.sag), sag, 0.0)
     coefficients = used.coefficients - used.applied @ fit.influence_zernike.T - fit.zernike_offset
-    return replace(used, sag=less_drift(sag), coefficients=less_drift(coefficients))
+    return replace(used, sag=without(sag, drift), coefficients=without(coefficients, drift))
 
 
 def influence(calibration: Calibration) -> Section:
