@@ -1,7 +1,6 @@
 """Measurements, on request, from a sensor that publishes Zernike coefficients. Independent of ROS."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -95,15 +94,10 @@ class SensorAcquisition:
             MapRejectedError and whatever else `read` raises: the measurement is unusable.
             Refusal: MAP_TIMEOUT when none came in time, INTERFEROMETER_INACTIVE when :meth:`stop` was called meanwhile.
         """
-        deadline = time.monotonic() + timeout_s
         with self._changed:
             self._seen, self._since = None, self._now_ns()
-            try:
-                while self._seen is None and not self._stopped and (left := deadline - time.monotonic()) > 0.0:
-                    self._changed.wait(left)
-            finally:
-                self._since = -1
-            found = self._seen
+            self._changed.wait_for(lambda: self._seen is not None or self._stopped, timeout_s)
+            found, self._since = self._seen, -1
         if self._stopped:
             raise Refusal(
                 ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer was deactivated during the measurement"
