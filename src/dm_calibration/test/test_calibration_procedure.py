@@ -280,3 +280,26 @@ def test_what_failed_after_a_bump_is_measured_again(bench: LinearBench, mirror: 
     outcome.take(Doubted(2, "bumped"))
     assert [step for step in range(10) if outcome.tried(step)] == [1, 2, 3, 9]
     assert outcome.dropped == ["poke+01: it was bad", "a bowl: out of reach", f"{others[3].label}: bumped"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "stop_at", "before", "after"),
+    [
+        # Maps 1 and 3 of a state fail, then the run is interrupted.
+        (PlanKind.POKES, "poke+03 (3)", ["poke+03", "poke+03 (3)"], []),
+        # The run is interrupted after map 1 of a state; the others fail when it is resumed.
+        (PlanKind.HYSTERESIS, "excitation 30", [], ["excitation 30 (2)", "excitation 30 (3)"]),
+    ],
+)
+def test_labels_stay_unique_where_a_state_is_continued(
+    kind: PlanKind, stop_at: str, before: list[str], after: list[str], bench: LinearBench, mirror: Mirror
+) -> None:
+    plan, options = make_plan(kind, mirror), ProcedureOptions(maps_per_state=3, measure_retries=0)
+    outcome = Outcome()
+    bench.failing, bench.stop_at = dict.fromkeys(before, 1), stop_at
+    with pytest.raises(Cancelled):
+        Procedure(plan, mirror, bench, options, cancelled=lambda: bench.stopped, outcome=outcome).run()
+    bench.stopped, bench.stop_at, bench.failing = False, "", dict.fromkeys(after, 1)
+    Procedure(plan, mirror, bench, options, outcome=outcome).run()
+    shown = [label for label in outcome.maps().label if label.startswith(stop_at.removesuffix(" (3)"))]
+    assert len(shown) == 2

@@ -131,7 +131,6 @@ class Outcome:
     targets: list[str] = field(default_factory=list)
     segment: int = 0
     centres: list[tuple[float, float]] = field(default_factory=list)
-    _given_up: dict[int, int] = field(default_factory=dict)
     # Each drop, and the number of records before it.
     _drops: list[tuple[int, Dropped]] = field(default_factory=list)
     # Number of events since the last map: drops, and commands without a map.
@@ -156,7 +155,6 @@ class Outcome:
                 self.dropped.append(event.reason)
                 self._failing += 1
                 self._drops.append((len(self.records), event))
-                self._given_up[event.step] = self._given_up.get(event.step, 0) + (1_000_000 if event.whole else 1)
             case Solved():
                 if event.target not in self.targets:  # solved again after an interruption
                     self.targets.append(event.target)
@@ -166,7 +164,8 @@ class Outcome:
 
     def tried(self, step: int) -> int:
         """Number of maps of the state `step` that were taken or given up."""
-        return sum(record.step == step for record in self.records) + self._given_up.get(step, 0)
+        given_up = sum(1_000_000 if drop.whole else 1 for _before, drop in self._drops if drop.step == step)
+        return sum(record.step == step for record in self.records) + given_up
 
     def maps(self) -> MapSet:
         """All maps measured.
@@ -193,8 +192,6 @@ class Outcome:
     def _begin(self, number: int) -> None:
         """Begin a segment. The last failures are forgotten and tried again: the run may have ended because of them."""
         if number and self._failing:
-            for _before, drop in self._drops[-self._failing :]:
-                self._given_up.pop(drop.step, None)
             del self.dropped[-self._failing :], self._drops[-self._failing :]
         if number and self._unseen:
             del self.records[-self._unseen :], self.centres[-self._unseen :]
@@ -209,8 +206,6 @@ class Outcome:
         failed = [drop for before, drop in self._drops if before >= event.kept and not drop.whole]
         for drop in failed:
             self.dropped.remove(drop.reason)
-        for step in {record.step for record in doubtful} | {drop.step for drop in failed}:
-            self._given_up.pop(step, None)
         self._drops = [each for each in self._drops if each[0] < event.kept or each[1].whole]
         del self.records[event.kept :], self.centres[event.kept :]
         self._failing = self._unseen = 0

@@ -209,21 +209,22 @@ class Procedure:
             raise Cancelled("cancelled while settling")
         taken = 0
         failure = MeasurementError(ErrorCode.MAP_REJECTED, "")
+        one = step
         for repeat in range(self.outcome.tried(number), repeats):
-            label = step.label if repeat == 0 else f"{step.label} ({repeat + 1})"
+            one = replace(step, label=f"{step.label} ({repeat + 1})") if repeat else step
             try:
-                self._take(label, step, number, applied)
+                self._take(one, number, applied)
                 taken += 1
             except MeasurementError as error:
-                self._note(Dropped(number, f"{label}: {error}"))
+                self._note(Dropped(number, f"{one.label}: {error}"))
                 failure = error
         if not taken:
-            self._note_unseen(step, number, applied)
+            self._note_unseen(one, number, applied)
         self._failures = 0 if taken else self._failures + 1
         if self._failures >= self._options.failures_max:
             raise Refusal(failure.error_code, f"{self._failures} states in a row gave no map; the last: {failure}")
 
-    def _take(self, label: str, step: Step, number: int, applied: Floats) -> None:
+    def _take(self, step: Step, number: int, applied: Floats) -> None:
         """Take a map of the present state, the signals `applied` (N,); `number`: of the state in the run.
 
         Raises MeasurementError if every try failed, Refusal if two reference frames show that the mirror was bumped.
@@ -231,16 +232,16 @@ class Procedure:
         for attempt in range(self._options.measure_retries + 1):
             self._checkpoint()
             try:
-                taken = self._map(label, step, number, applied)
+                taken = self._map(step, number, applied)
                 break
             except MeasurementError as error:
                 if attempt == self._options.measure_retries:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
         if step.kind is StepKind.REFERENCE and self._bump.change(taken, self._interrupted):
-            taken = self._map(label, step, number, applied)  # a bad map or a moved mirror: a second map decides
+            taken = self._map(step, number, applied)  # a bad map or a moved mirror: a second map decides
             if suspicion := self._bump.change(taken, self._interrupted):
-                self._stop_bumped(label, suspicion)
+                self._stop_bumped(step.label, suspicion)
         self._note(taken)
         self._bump.take(taken)
         self._interrupted = False
@@ -262,9 +263,9 @@ class Procedure:
             "doubt; put the mirror back and start again to go on from the last good reference frame",
         )
 
-    def _map(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
+    def _map(self, step: Step, number: int, applied: Floats) -> MapTaken:
         """Take a map that is comparable with the others."""
-        measured = self._bench.measure(label)
+        measured = self._bench.measure(step.label)
         self._guard()
         check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
         if self.outcome.setup is None:
@@ -272,7 +273,7 @@ class Procedure:
         assert step.signals is not None
         record = replace(
             measured,
-            label=label,
+            label=step.label,
             kind=step.kind.value,
             step=number,
             signals=step.signals,
