@@ -61,14 +61,16 @@ class BumpCheck:
             self._last = taken
             self._moved = np.zeros_like(self._moved)
             return
-        if record.kind == StepKind.DEGAUSSED:
-            self.degaussed()
-        away = record.applied - self._rest
-        self._moved = np.maximum(self._moved, np.abs(away))
+        self.moved(record.applied)
         if self._last is not None and np.isfinite(record.coefficients).all():
             self._shown += _figure_rms(record.coefficients - self._last.record.coefficients) ** 2
+            away = record.applied - self._rest
             # A signal common to all actuators lifts the plate without bending it.
             self._commanded += float(np.square(away - (away.mean() if len(away) > 1 else 0.0)).sum())
+
+    def moved(self, applied: Floats) -> None:
+        """Note that the signals `applied` (N,) were written, whether or not a map follows."""
+        self._moved = np.maximum(self._moved, np.abs(applied - self._rest))
 
     def degaussed(self) -> None:
         """Note that all actuators have moved through their whole range."""

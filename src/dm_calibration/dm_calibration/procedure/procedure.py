@@ -144,6 +144,7 @@ class Procedure:
         self._report(planned.label, planned.kind, number)
         if planned.kind is StepKind.DEGAUSS:
             self._bench.degauss()
+            self._bump.degaussed()
             if not self.outcome.records:
                 self._note(Segment(0, time.time_ns()))
         elif (step := self._solved(planned, number)) is not None:
@@ -205,6 +206,7 @@ class Procedure:
     def _measure_state(self, step: Step, number: int, repeats: int) -> None:
         assert step.signals is not None
         applied = self._bench.apply(step.signals)
+        self._bump.moved(applied)
         if not self._bench.settle(step.dwell, step.settle_share):
             raise Cancelled("cancelled while settling")
         taken = 0
