@@ -309,3 +309,22 @@ def test_a_move_without_a_map_may_have_left_hysteresis(mirror: Mirror) -> None:
     bench = LinearBench(mirror, backlash=0.2, share=0.3)
     bench.failing = {"poke-03": 9}
     assert len(run(bench, mirror, plan_options=PlanOptions(reference_every=1)).outcome.dropped) == 1
+
+
+@pytest.mark.parametrize("back_s", [3, 60])
+def test_a_clock_set_back_spoils_no_run(back_s: int, bench: LinearBench, mirror: Mirror) -> None:
+    """Maps wait for it to catch up, else the run ends and is resumed later."""
+    plan, outcome = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=60)), Outcome()
+
+    def set_back(progress: Progress) -> None:
+        if progress.done == 10:
+            bench.clock_ns -= back_s * 10**9
+
+    procedure = Procedure(plan, mirror, bench, outcome=outcome, progress=set_back)
+    if back_s > 10:
+        with pytest.raises(Refusal, match="s before that of the map before it: must be later; was the clock set back"):
+            procedure.run()
+        bench.clock_ns += back_s * 10**9
+        procedure = Procedure(plan, mirror, bench, outcome=outcome)
+    maps = procedure.run().maps()
+    assert (np.diff(maps.stamp_ns) >= 0).all() and len(outcome.dropped) <= 2

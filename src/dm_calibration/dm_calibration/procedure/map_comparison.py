@@ -29,6 +29,18 @@ def check_comparable(
         raise MeasurementError(ErrorCode.MAP_REJECTED, different)
 
 
+def check_rising(measured: Measurement, outcome: Outcome) -> None:
+    """Refuse a map that is dated before the last one of `outcome`: creep cannot be identified then.
+
+    Raises:
+        MeasurementError: the message names how far its time is behind.
+    """
+    back = 1e-9 * (outcome.records[-1].stamp_ns - measured.stamp_ns) if outcome.records else 0.0
+    if back > 0.0:
+        text = f"its stamp is {back:.3f} s before that of the map before it: must be later; was the clock set back?"
+        raise MeasurementError(ErrorCode.MAP_REJECTED, text)
+
+
 def _difference(measured: Measurement, outcome: Outcome, working_radius: float, tolerance: float) -> str:
     """How a map differs from those before; "" = not at all."""
     if measured.radius > 0.0 and abs(measured.radius - working_radius) > tolerance * working_radius:

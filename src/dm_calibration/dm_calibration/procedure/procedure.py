@@ -14,7 +14,7 @@ from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
-from dm_calibration.procedure.map_comparison import check_comparable
+from dm_calibration.procedure.map_comparison import check_comparable, check_rising
 from dm_calibration.procedure.outcome import (
     Doubted,
     Dropped,
@@ -152,10 +152,9 @@ class Procedure:
 
     def _go_on(self, done: int) -> None:
         """Begin a new segment after an interruption: degauss, then a map of the mirror at rest."""
-        last = self.outcome.records[-1].label
         self._checkpoint()
         if self._plan.steps[0].kind is StepKind.DEGAUSS:
-            self._report(f"degauss (resumed after {last})", StepKind.DEGAUSS, done)
+            self._report(f"degauss (resumed after {self.outcome.records[-1].label})", StepKind.DEGAUSS, done)
             self._bench.degauss()
         self._note(Segment(self.outcome.segment + 1, time.time_ns()))
         self._bump.degaussed()
@@ -163,8 +162,7 @@ class Procedure:
         step = Step(f"reference resumed {self.outcome.segment}", StepKind.REFERENCE, self._mirror.rest)
         self._report(step.label, step.kind, done)
         repeats = max(self._options.maps_per_state, RESUME_MAPS if self._plan.kind is PlanKind.HYSTERESIS else 1)
-        number = len(self._plan.steps) + self.outcome.segment
-        self._measure_state(step, number, repeats)
+        self._measure_state(step, len(self._plan.steps) + self.outcome.segment, repeats)
         if self._failures:
             raise Refusal(ErrorCode.MAP_REJECTED, f"{step.label} gave no map, without which the run cannot go on")
 
@@ -270,6 +268,8 @@ class Procedure:
         measured = self._bench.measure(step.label)
         self._guard()
         check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
+        if self._plan.kind is PlanKind.HYSTERESIS:
+            check_rising(measured, self.outcome)
         if self.outcome.setup is None:
             self._note(Setup.of(measured))
         assert step.signals is not None
