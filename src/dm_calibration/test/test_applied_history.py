@@ -203,3 +203,17 @@ def test_a_report_counts_as_heard_once_it_is_followed(
         monkeypatch.setattr(history, "_track", tracked)
         driver.go(10.0, 0.2)
         assert waiting[0].result()
+
+
+def test_a_shape_from_before_the_clock_was_set_back_is_not_that_of_a_map(
+    history: AppliedHistory, driver: Driver
+) -> None:
+    driver.go(100.0, 0.2)
+    driver.go(3000.0, 0.4)
+    assert history.latest is not None
+    history.observe(replace(history.latest, heard=2016.0))  # the driver repeats its report: the shape still stands
+    with pytest.raises(MapNotUsableError, match="no actuator_state from that time"):
+        history.settled(2015.0, 0.5)
+    driver.report(2020.0)  # a correction that holds the shape
+    assert history.still_for(2021.0) == 1.0
+    assert (history.settled(2025.0, 0.5).effective == 0.4).all()

@@ -294,7 +294,8 @@ def test_what_failed_after_a_bump_is_measured_again(bench: LinearBench, mirror: 
 def test_labels_stay_unique_where_a_state_is_continued(
     kind: PlanKind, stop_at: str, before: list[str], after: list[str], bench: LinearBench, mirror: Mirror
 ) -> None:
-    plan, options = make_plan(kind, mirror), ProcedureOptions(maps_per_state=3, measure_retries=0)
+    plan = make_plan(kind, mirror, PlanOptions(hysteresis_maps=60))
+    options = ProcedureOptions(maps_per_state=3, measure_retries=0)
     outcome = Outcome()
     bench.failing, bench.stop_at = dict.fromkeys(before, 1), stop_at
     with pytest.raises(Cancelled):

@@ -12,6 +12,8 @@ from dm_common.hysteresis.observer import HysteresisObserver, Observed
 
 #: Signals, or effective signals, that differ by up to this (normalised) count as the same shape: below 1 nm of sag.
 SMALL_MOVE = 2e-4
+#: Reports dated after a later one by more than this, s, are from before the clock was set back; clocks differ by less.
+CLOCKS_DIFFER_S = 1.0
 
 
 class MapNotUsableError(CodedError, ValueError):
@@ -47,7 +49,7 @@ class AppliedHistory(HysteresisObserver):
 
     def still_for(self, time: float) -> float:
         """How long the mirror has kept its present shape until `time`, s; 0 = it moves, infinite = no report yet."""
-        observed = self.recent()
+        observed = self._since_set_back()
         if not observed:
             return float("inf")
         if not self._keeps(observed[-1], observed[-1]):
@@ -63,7 +65,7 @@ class AppliedHistory(HysteresisObserver):
         Raises:
             MapNotUsableError: the mirror moved, or this or the hysteresis of the actuators is not known.
         """
-        law, observed = self.law, self.recent()
+        law, observed = self.law, self._since_set_back()
         times = [seen.report.time for seen in observed]
         at = next((k for k in reversed(range(len(observed))) if times[k] <= time), None)
         if at is None:
@@ -92,6 +94,17 @@ class AppliedHistory(HysteresisObserver):
                 "(./dm degauss) cures that"
             )
         return SettledState(law.effective(law.advance(estimate.state, time)), since)
+
+    def _since_set_back(self) -> list[Observed]:
+        """Recent states since the clock was last set back; the times of those before say nothing of a map's state."""
+        observed = self.recent()
+        heard = self.latest.heard if self.latest is not None else -np.inf
+        after = heard if heard > -np.inf else np.inf  # time of the later reports; infinite = not known
+        for k in reversed(range(len(observed))):
+            if observed[k].report.time > after + CLOCKS_DIFFER_S:
+                return observed[k + 1 :]
+            after = min(after, observed[k].report.time)
+        return observed
 
     def _since(self, observed: Sequence[Observed], at: int) -> int:
         """Index of the first report since which the shape of report `at` was kept."""
