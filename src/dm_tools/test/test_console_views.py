@@ -623,7 +623,9 @@ def test_signals_are_waited_for_as_long_as_the_way_takes_and_sent_again_to_a_dri
         assert request.wait and list(request.signals) == [0.5]
 
     snapshot = SimpleNamespace(mirror_info=MirrorInfo(), actuator_state=ActuatorState(requested=[0.1]))
-    session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=[0.5], poked=[0.1], snapshot=lambda: snapshot)
+    ros: Any = SimpleNamespace(call=call, snapshot=lambda: snapshot)
+    session = Session(ros, poke=([0.5], [0.1]))
+    assert session.base == [0.5]
     assert asyncio.run(operations.release(session)) == "back at the shape before"
     assert asked == [("set_signals", math.inf, True)] and session.base is None
 
@@ -640,3 +642,13 @@ def test_a_poke_has_settled_when_its_map_is_taken() -> None:
     assert "Map: rms" in asyncio.run(operations.poke(session, 1, 0.1, then_measure=True))
     (first, moved), (second, taken) = asked
     assert (first, second) == ("set_signals", "measure") and taken - moved >= operations.SETTLE_S
+
+
+def test_nothing_is_poked_once_the_mirror_was_moved() -> None:
+    """By whatever moved it, such as a calibration."""
+    snapshot = SimpleNamespace(mirror_info=MirrorInfo(), actuator_state=ActuatorState(requested=[0.1]))
+    ros: Any = SimpleNamespace(snapshot=lambda: snapshot)
+    session = Session(ros, poke=([0.5], [0.1]))
+    assert session.base == [0.5]
+    snapshot.actuator_state = ActuatorState(requested=[0.0])
+    assert session.base is None and asyncio.run(operations.release(session)) == "nothing is poked"

@@ -39,14 +39,12 @@ async def predict(session: Session, request: FocusRequest) -> str:
 async def move(session: Session, request: FocusRequest) -> str:
     """Move to the curvature of `request`."""
     result = await session.run("move_focus", MoveFocus.Goal(request=request))
-    session.base = None
     return f"{request.curvature:+.4f} 1/m reached after {result.duration:.2f} s. {prediction_text(result.state)}"
 
 
 async def converge(session: Session, request: FocusRequest) -> str:
     """Correct the command on the interferometer until the surface is right."""
     result = await session.run("converge", Converge.Goal(request=request))
-    session.base = None
     figures = f"{result.residual_rms * 1e9:.1f} nm rms, largest coefficient {result.max_zernike * 1e9:.2f} nm"
     return f"{figures}, {result.maps} maps"
 
@@ -54,14 +52,12 @@ async def converge(session: Session, request: FocusRequest) -> str:
 async def flatten(session: Session) -> str:
     """Make the surface flat."""
     answer = await session.ros.call("flatten", Flatten.Request())
-    session.base = None
     return prediction_text(answer.state)
 
 
 async def degauss(session: Session) -> str:
     """Wipe the history of the actuators."""
     answer = await session.run("degauss", Degauss.Goal())
-    session.base = None
     return f"done in {answer.duration:.1f} s; the mirror is at mid range"
 
 
@@ -91,7 +87,6 @@ async def estimate(session: Session, goal: Calibrate.Goal) -> str:
 async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
     """Condition the mirror, then converge, for every shape of the goal; stored with the calibration in use."""
     result = await session.run("build_recipes", goal)
-    session.base = None
     return str(result.message)
 
 
@@ -121,11 +116,10 @@ async def _set_signals(session: Session, signals: list[float]) -> None:
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
     """Move one actuator away from the shape before the first poke."""
     mirror, requested = _mirror_and_signals(session)
-    still_poked = np.array_equal(requested, session.poked)
-    base = session.base if session.base is not None and still_poked else requested
+    base = session.base or requested
     signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
     await _set_signals(session, signals)
-    session.base, session.poked = base, signals
+    session.poke = base, signals
     text = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
     if not then_measure:
         return text
@@ -135,14 +129,11 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
 
 async def release(session: Session) -> str:
     """Go back to the shape before the poke."""
-    base, (_, requested) = session.base, _mirror_and_signals(session)
-    if base is None:
+    if (base := session.base) is None:
         return "nothing is poked"
-    ours = np.array_equal(requested, session.poked)
-    if ours:
-        await _set_signals(session, base)
-    session.base = None
-    return "back at the shape before" if ours else "the mirror was moved by somebody else since; it stays where it is"
+    await _set_signals(session, base)
+    session.poke = None
+    return "back at the shape before"
 
 
 async def measure_loop(session: Session, actuator: int, amplitude: float) -> str:

@@ -74,8 +74,7 @@ class Session:
     Attributes:
         outcome: the last success, in words.
         chosen: number of the actuator that is shown.
-        base: signals to go back to when a poke is released; None = nothing is poked.
-        poked: signals of the last poke.
+        poke: signals before the last poke, and with it; None = there was none, or it was released.
         loops: {(id of the calibration, actuator): measured loop}.
     """
 
@@ -84,8 +83,7 @@ class Session:
     progress: Progress = field(default_factory=Progress)
     outcome: str = ""
     chosen: int = 1
-    base: list[float] | None = None
-    poked: list[float] = field(default_factory=list)
+    poke: tuple[list[float], list[float]] | None = None
     loops: dict[tuple[str, int], Loop] = field(default_factory=dict)
     _outcome_ends: float = 0.0
     _cancel: str | None = None
@@ -99,6 +97,12 @@ class Session:
         if now > self._outcome_ends:
             self.outcome = ""
         return self.ros.snapshot()
+
+    @property
+    def base(self) -> list[float] | None:
+        """Signals to go back to when the poke is released; None = nothing is poked, or the mirror was moved since."""
+        state = self.ros.snapshot().actuator_state
+        return self.poke[0] if self.poke and state is not None and list(state.requested) == self.poke[1] else None
 
     @property
     def running(self) -> str:
