@@ -38,7 +38,7 @@ def check_rising(measured: Measurement, outcome: Outcome) -> None:
     back = 1e-9 * (outcome.records[-1].stamp_ns - measured.stamp_ns) if outcome.records else 0.0
     if back > 0.0:
         text = f"its stamp is {back:.3f} s before that of the map before it: must be later; was the clock set back?"
-        raise MeasurementError(ErrorCode.MAP_REJECTED, text)
+        raise MeasurementError(ErrorCode.MAP_REJECTED, f"{text} Correct it before the run is resumed")
 
 
 def _difference(measured: Measurement, outcome: Outcome, working_radius: float, tolerance: float) -> str:
