@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 from dm_msgs.msg import Capabilities
 from reportlab.platypus import LongTable, Paragraph
 from scipy.optimize import linprog
+from scipy.stats import theilslopes
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
@@ -38,6 +40,7 @@ from dm_calibration.report.html_page import html_page
 from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common import Floats
 from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel
 from dm_common.optics.conic import conic_coefficients, range_text
 from dm_common.optics.piston_tilt import rms
@@ -256,6 +259,20 @@ def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibrat
     term = section.partition("Valid until ")[2].partition(".</p>")[0]
     assert "the error grows by" in term and f"<td>valid until</td><td>{term}</td>" in page  # the certificate's
     assert section.count("<img ") == 1
+
+
+def test_a_log_of_very_many_checks_has_a_trend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of an instrument that measures continuously: the slopes of all pairs would not fit into memory."""
+    seen: list[float] = []
+
+    def slopes(error: Floats, time: Floats, share: float) -> object:
+        seen.extend(time)
+        return theilslopes(error, time, share)
+
+    monkeypatch.setattr(scipy.stats, "theilslopes", slopes)
+    checks = [Check(60.0 * k, 1, 1e-9 + 1e-14 * k, 1e-9, 1.0, 0.0, 1, 0.0) for k in range(100_000)]
+    assert "the error grows by +0.43 nm in 30 days" in valid_until(checks, 5e-9, 0.0)[1]
+    assert len(seen) == 500 and max(seen) - min(seen) == pytest.approx(6e6, rel=0.01)
 
 
 @pytest.mark.parametrize("lines", range(0, 60, 4))

@@ -15,6 +15,8 @@ from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Pictur
 DAY_S = 86400.0
 #: Fewest checks, and least time (s) between the first and the last, from which a trend is computed.
 TREND_MIN, TREND_SPAN_S = 5, DAY_S
+#: Most checks from which a trend is computed, evenly chosen: the slopes of all pairs take room with their square.
+TREND_MAX = 500
 #: Number of checks in the table, the latest ones.
 SHOWN = 20
 
@@ -38,7 +40,8 @@ def valid_until(
         return stale, "too few checks to see a trend; each check that agrees extends it"
     from scipy.stats import theilslopes  # here: it takes as long to import as half of a report's other libraries
 
-    time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
+    chosen = checks[:: -len(checks) // TREND_MAX][::-1]  # the last one is among them
+    time, error = (np.array([getattr(check, name) for check in chosen]) for name in ("time", "max_zernike"))
     slope, level, low, _high = theilslopes(error, time - time[0], 0.9)
     per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
     if low <= 0.0:
