@@ -92,6 +92,13 @@ def test_a_map_that_agrees_is_taken(bench: SteadyMirror, updates: RecalibrationM
     assert known(updates).checked_ns == bench.clock_ns
 
 
+def test_an_older_map_that_comes_late_is_not_the_last_check(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    older, newer = bench.measure("older"), bench.measure("newer", days=2.0)
+    for measured in (newer, older):
+        assert updates.take(measured, bench.settled()).accepted
+    assert (known(updates).revision, known(updates).checked_ns) == (2, newer.stamp_ns)
+
+
 @pytest.mark.slow
 def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
     updates = begun(made, tmp_path)

@@ -60,7 +60,7 @@ class Drift:
         covariance: (N + 3 R + 1, N + 3 R + 1) of gain, offset, thermal and crept.
         stamp_ns: time for which these values hold.
         revision: number of maps used.
-        checked_ns: stamp of the last of them; 0 = none.
+        checked_ns: latest stamp of these; 0 = none.
         surprising: number of the latest maps, in a row, that disagreed.
         disagreement: largest error (m) in these maps, or in other shapes by the faulty actuators that they show.
         evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and sum of their

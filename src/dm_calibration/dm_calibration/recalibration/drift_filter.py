@@ -167,7 +167,7 @@ class DriftFilter:
             covariance=0.5 * (covariance + covariance.T),
             stamp_ns=max(measured.stamp_ns, drift.stamp_ns),
             revision=drift.revision + 1,
-            checked_ns=measured.stamp_ns,
+            checked_ns=max(measured.stamp_ns, drift.checked_ns),
             surprising=0,
             disagreement=0.0,
             evidence=evidence,
