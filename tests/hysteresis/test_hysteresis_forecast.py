@@ -101,6 +101,8 @@ def test_mirrors_of_one_actuator_and_of_many(rings: int, maps: int) -> None:
     assert all(np.isfinite(step.signals).all() for step in plan.steps if step.signals is not None)
     assert found.duration > 0.0
     assert (found.max_zernike > 0.0) == (maps == 420)
+    linear: Any = SimpleNamespace(hysteresis=None, maps=())  # a calibration by pokes tells no more
+    assert (forecast(plan, 0.5, linear, mirror, until=1e-3).max_zernike > 0.0) == (maps == 420)
     assert found.maps == (maps_of(plan.steps[: min(plan.ends)]) if maps == 420 else 0)
 
 
