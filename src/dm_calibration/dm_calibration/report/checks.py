@@ -71,7 +71,8 @@ def checks_section(calibration: Calibration, checks: Sequence[Check], values: Ma
         f"{sum(not check.accepted for check in checks)} disagreed, {outside} showed more than the promise of "
         f"{length(promised, calibration.wavelength)}: one in twenty may.",
         f"In {days:.1f} days gains have changed by up to {last.gain_drift:.2%} (actuator {last.actuator}), the figure "
-        f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows.",
+        f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows, until its updates are forgotten "
+        "(./dm check --forget).",
         f"Valid until {utc(round(until * 1e9))}: {reason}.",
     ]
     rows = [
