@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +25,7 @@ from dm_calibration.procedure.outcome import Event, MapTaken
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.procedure.resumable_run import OpenRun, identity_of, open_run
-from dm_calibration.procedure.run_journal import EVENTS, read_run
+from dm_calibration.procedure.run_journal import EVENTS, MANIFEST, read_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
@@ -220,6 +221,16 @@ def test_why_a_run_does_not_go_on_is_told(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.delitem(_EVENTS, "MapTaken")
     other = opened(tmp_path, POKES)
     assert not other.resumed and "'MapTaken' of another version" in " ".join(other.notes)
+
+
+def test_a_damaged_manifest_stops_no_goal_and_one_that_is_gone_is_no_run(tmp_path: Path) -> None:
+    runs = [opened(tmp_path, POKES, number=number) for number in range(2)]
+    damaged, removed = (run.journal.folder / MANIFEST for run in runs)
+    damaged.write_text(json.dumps(json.loads(damaged.read_text()) | {"identity": None}))
+    removed.unlink()  # the power failed while the journal of a finished run was deleted
+    assert opened(tmp_path, POKES).notes == (
+        f"unfinished run {runs[0].journal.folder.name}: {MANIFEST} does not name the plan and settings of the run",
+    )
 
 
 def test_what_failed_last_is_tried_again(tmp_path: Path) -> None:

@@ -157,7 +157,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder.name}: schema version {content.get('schema_version')}: this software reads {SCHEMA_VERSION}"
         )
     identity = content.get("identity")
-    if isinstance(identity, dict) and "plan_options" in identity:  # before 0.2: all options, even those not used
+    if not isinstance(identity, dict):
+        raise JournalError(f"{folder.name}: {MANIFEST} does not name the plan and settings of the run")
+    if "plan_options" in identity:  # before 0.2: all options, even those not used
         identity["until"] = identity.pop("plan_options").get("until", 0.0)
         if identity.get("plan") == "MEMORY":
             identity["plan"] = "HYSTERESIS"

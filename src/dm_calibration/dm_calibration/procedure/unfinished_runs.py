@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal, read_manifest, read_run
+from dm_calibration.procedure.run_journal import MANIFEST, JournalError, Kept, RunJournal, read_manifest, read_run
 from dm_common.atomic_write import storing
 from dm_common.errors import ErrorCode, Refusal
 
@@ -86,8 +86,8 @@ class UnfinishedRuns:
             try:
                 theirs = read_manifest(folder)["identity"]
                 kept = read_run(folder, remarks) if theirs == identity else None
-            except (JournalError, KeyError) as error:
-                others.append(f"{folder.name}: {error}")
+            except JournalError as error:
+                others.append(str(error))
                 continue
             if kept is None:
                 differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
@@ -122,5 +122,8 @@ class UnfinishedRuns:
         return [
             path
             for path in self.folder.iterdir()
-            if path.is_dir() and not path.is_symlink() and not path.name.startswith(".") and path.suffix != ASIDE
+            if (path / MANIFEST).is_file()
+            and not path.is_symlink()
+            and not path.name.startswith(".")
+            and path.suffix != ASIDE
         ]
