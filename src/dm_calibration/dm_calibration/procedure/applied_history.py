@@ -12,8 +12,8 @@ from dm_common.hysteresis.observer import HysteresisObserver, Observed
 
 #: Signals, or effective signals, that differ by up to this (normalised) count as the same shape: below 1 nm of sag.
 SMALL_MOVE = 2e-4
-#: Reports dated after a later one by more than this, s, are from before the clock was set back; clocks differ by less.
-CLOCKS_DIFFER_S = 1.0
+#: Reports dated after a later one by more than this, s, are of before the clock was set back; clocks differ less.
+CLOCKS_DIFFER_S = 5.0
 
 
 class MapNotUsableError(CodedError, ValueError):
