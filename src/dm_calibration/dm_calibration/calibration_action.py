@@ -16,6 +16,7 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.forecast import GoodEnough, error_after_one_map, expected_end, forecast, step_times
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
@@ -164,6 +165,13 @@ class CalibrateAction:
         self._feedback.plan = plan_text(self._plan.kind, self._options, self._maps_per_state)
         self._services.publish_waits(self._handle, self._feedback)
         in_use = self._manager.in_use
+
+        def enough_so_far(outcome: Outcome) -> bool:
+            phase = self._feedback.phase
+            self._report("fit", "fit", self._feedback.step)  # may take minutes
+            self._feedback.phase = phase
+            return enough(outcome)
+
         return Procedure(
             self._plan,
             self._mirror,
@@ -176,7 +184,7 @@ class CalibrateAction:
             outcome=run.outcome,
             keep=run.journal.keep,
             guard=self._guard,
-            enough=enough,
+            enough=enough_so_far,
         )
 
     def _guard(self) -> None:

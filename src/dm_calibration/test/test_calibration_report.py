@@ -249,6 +249,7 @@ def test_checks_say_what_drifts_and_until_when_it_is_valid(calibration: Calibrat
     ):
         until, text = valid_until(checks_of(known, growth), 5e-9, start)
         assert (until - start) / 86400.0 == pytest.approx(days, abs=3.0) and reason in text
+    assert "nm" not in valid_until(checks_of(known, -1e-10), 5e-9, start)[1]  # the slope of chance means nothing
     assert "too few checks" in valid_until(checks_of(known, 1e-10, 3), 5e-9, start)[1]
     for check in checks_of(known, 1e-10):
         append_check(tmp_path / f"{known.id}.checks.csv", check)

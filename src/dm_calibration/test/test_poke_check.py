@@ -238,6 +238,7 @@ def test_pokes_too_small_to_see() -> None:
     silent = np.arange(37) % 5 != 0
     findings = check(response(), silent=silent).findings
     assert "only 8 of 37 actuators answer above the noise: the pokes are too small" in findings[0]
+    assert "mirror.channels" in findings[0]
     # Two that answer as they should say nothing of the pokes.
     findings = check(response(), unmoved=np.arange(37) > 1).findings
     assert findings == ("only 2 actuators were moved: a check of wiring and orientation needs 3",)

@@ -333,6 +333,7 @@ def test_where_nothing_is_reachable_capabilities_say_so(bench: Bench) -> None:
     message = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
     assert message.error_code == ErrorCode.UNREACHABLE and "nan" not in message.message
     assert "no curvature is reachable: the initial figure takes more than the limits permit" in message.message
+    assert "reachable_tolerance" in message.message
     assert health(bench.controller, VALUES, bench.now).message.startswith(message.message)
     bench.ask(0.01)
     assert "no curvature is reachable: the initial figure" in str(bench.refusal())

@@ -85,7 +85,7 @@ def write_parameters(
         OSError: `source` cannot be read, or `target` cannot be written; an existing `target` is then unchanged.
     """
     if not parameters:
-        console.print(f"no parameter to change: {source} is correct, {target} is not written")
+        console.print(f"no parameter of {source} found to change, so {target} is not written")
         return
     camera = CAMERA if source == shared_config("bench.yaml") and "autofocus" in nodes else {}
     text = edited(edited(source.read_text(), camera), values_of(parameters), namespace)

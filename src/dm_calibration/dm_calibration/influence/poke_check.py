@@ -104,7 +104,8 @@ def check_pokes(
     if active.size < max(ANSWERS_MIN, ANSWERS_SHARE * (active.size + quiet.sum())):
         problem = (
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
-            "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
+            "small (poke_amplitude), the drive is off, or most channels are those of no actuator (mirror.channels); "
+            "wiring and orientation cannot be checked"
             if quiet.any()
             else f"only {active.size} actuators were moved: a check of wiring and orientation needs {ANSWERS_MIN}"
         )

@@ -43,9 +43,9 @@ def valid_until(
     chosen = checks[:: -len(checks) // TREND_MAX][::-1]  # the last one is among them
     time, error = (np.array([getattr(check, name) for check in chosen]) for name in ("time", "max_zernike"))
     slope, level, low, _high = theilslopes(error, time - time[0], 0.9)
-    per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
     if low <= 0.0:
-        return stale, f"no growth of the error beyond chance ({per_month}); each check that agrees extends it"
+        return stale, "no growth of the error beyond chance; each check that agrees extends it"
+    per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
     reached = max(float(time[0] + max(promised - level, 0.0) / slope), float(time[-1]))
     if reached > stale:
         return (

@@ -61,7 +61,8 @@ def serial_port(device: Path) -> Finding | None:
     if not device.exists():
         return Finding(
             f"{device} does not exist",
-            "plug the unit in; `ls -l /dev/serial/by-id` lists the units under names that stay the same",
+            "plug the unit in; `ls -l /dev/serial/by-id` lists the units under names that stay the same; for a unit "
+            "behind a TCP port see docs/add-a-drive-unit.md",
         )
     if not os.access(device, os.R_OK | os.W_OK):
         group = _group(device)
