@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
 
 from calibration_stand_in import StandIn, doubles
+from dm_calibration import calibration_action
 from dm_calibration.calibration_node import CalibrationNode
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
@@ -179,6 +181,23 @@ def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, ob
         lambda: (r := observer.call(LoadCalibration, "load_calibration")).error_code == ErrorCode.OK and r, 10
     )
     assert newest.id == fitted.id
+
+
+def test_a_fit_in_the_middle_of_a_run_is_reported_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[Any] = []
+    action = MagicMock(_feedback=Calibrate.Feedback(phase="hysteresis", step=9))
+
+    def report(phase: str, _label: str, step: int) -> None:
+        action._feedback.phase = phase
+        said.append((phase, step))
+
+    action._report = report
+    for name in ("plan_text", "procedure_options"):
+        monkeypatch.setattr(calibration_action, name, MagicMock(return_value=""))
+    monkeypatch.setattr(calibration_action, "Procedure", lambda *_parts, **options: options["enough"])
+    enough: Any = calibration_action.CalibrateAction._procedure(action, MagicMock(), cast(Any, said.append))
+    enough("fitted")
+    assert said == [("fit", 9), "fitted"] and action._feedback.phase == "hysteresis"
 
 
 @pytest.mark.parametrize("deactivated", [False, True])
