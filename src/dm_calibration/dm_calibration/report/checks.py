@@ -65,11 +65,11 @@ def checks_section(calibration: Calibration, checks: Sequence[Check], values: Ma
     last, measured, promised = checks[-1], calibration.stamp_ns * 1e-9, calibration.promise
     days = max(last.time - measured, 1.0) / DAY_S
     until, reason = valid_until(checks, promised, measured, values)
-    outside = sum(check.max_zernike > promised for check in checks)
+    outside = sum(check.accepted and check.max_zernike > promised for check in checks)
     sentences = [
         f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "
-        f"{sum(not check.accepted for check in checks)} disagreed, {outside} showed more than the promise of "
-        f"{length(promised, calibration.wavelength)}: one in twenty may.",
+        f"{sum(not check.accepted for check in checks)} disagreed; of the others {outside} showed more than the promise "
+        f"of {length(promised, calibration.wavelength)}: one in twenty may.",
         f"In {days:.1f} days gains have changed by up to {last.gain_drift:.2%} (actuator {last.actuator}), the figure "
         f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows, until its updates are forgotten "
         "(./dm check --forget).",
