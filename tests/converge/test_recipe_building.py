@@ -256,3 +256,13 @@ def test_maps_left_out_are_counted() -> None:
     builder = RecipeBuilder(LOOP, plant, lambda: plant.time, BuildOptions(tolerance=1e-9))
     assert plant.left(builder.build(FocusTarget(0.02))) < 1e-9
     assert builder.left_out == 1
+
+
+def test_no_more_maps_are_taken_than_limits_leave_to_correct() -> None:
+    tight = Planner(CalibratedMirror(MODEL, replace(LIMITS, low=-0.06, high=0.06)))
+    plant = LinearPlant(GAINS)
+    options = BuildOptions(tolerance=1e-9, maps_max=80)
+    recipe = RecipeBuilder(tight, plant, lambda: plant.time, options).build(FocusTarget(0.02))
+    best = RecipeBuilder(tight, plant, lambda: plant.time, replace(options, tolerance=1e-12)).build(FocusTarget(0.02))
+    assert best.max_zernike > 2e-9 and recipe.max_zernike < best.max_zernike + 1e-9
+    assert recipe.maps <= 9

@@ -136,10 +136,14 @@ class RecipeBuilder:
             aim = self._solve(target, aim)
             taken = self._measure_round(target, aim, maps)
             maps += taken.maps
-            if self._error(taken).max_zernike <= options.tolerance or maps + options.average > options.maps_max:
+            aim = taken.aim
+            error = self._error(taken).max_zernike
+            # What limits and number of actuators leave even of a perfect correction.
+            least = self._error(replace(taken, aim=self._solve(target, aim))).max_zernike
+            least = least if least > options.tolerance else 0.0
+            if error <= least + options.tolerance or maps + options.average > options.maps_max:
                 self._built.append((taken, maps))
                 return self._recipe(taken, maps)
-            aim = taken.aim
 
     @property
     def recipes(self) -> tuple[Recipe, ...]:
