@@ -223,9 +223,9 @@ def commands() -> str:
     import typer
     from typer.cli import get_docs_for_click
 
-    from dm_tools.cli import app
+    from dm_tools.cli import make_app
 
-    group = typer.main.get_command(app)
+    group = typer.main.get_command(make_app())
     text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="./dm")
     text = text[text.index("\n## ") :]  # the commands, without the list of them
     text = re.sub(r"(?ms)^\*\*Usage\*\*:\n+```console\n.*?```\n+", "", text)

@@ -51,7 +51,7 @@ def test_what_is_no_length(text: str) -> None:
 
 @pytest.mark.parametrize("option", [("--until", "2nm"), ("--hysteresis", "100")])
 def test_maps_of_another_plan_are_no_hysteresis_run(option: tuple[str, str]) -> None:
-    found = CliRunner().invoke(cli.app, ["calibrate", "--plan", "pokes", *option])
+    found = CliRunner().invoke(cli.make_app(), ["calibrate", "--plan", "pokes", *option])
     assert (
         found.exit_code == 2
         and f"--plan pokes and {option[0]}: only the plan hysteresis has this option" in found.output
@@ -60,7 +60,7 @@ def test_maps_of_another_plan_are_no_hysteresis_run(option: tuple[str, str]) -> 
 
 @pytest.mark.parametrize("plan", [(), ("--plan", "surfaces")])
 def test_an_amplitude_of_pokes_is_for_plans_with_pokes(plan: tuple[str, ...]) -> None:
-    found = CliRunner().invoke(cli.app, ["calibrate", *plan, "--amplitude", "0.3"])
+    found = CliRunner().invoke(cli.make_app(), ["calibrate", *plan, "--amplitude", "0.3"])
     assert found.exit_code == 2 and "--amplitude: must be a plan with pokes" in found.output.replace("\n", " ")
 
 
@@ -68,9 +68,9 @@ def test_an_amplitude_of_pokes_is_for_plans_with_pokes(plan: tuple[str, ...]) ->
     "options", [("--plan", "pokes"), ("--settle", "3"), ("--maps-per-state", "2"), ("--no-activate",)]
 )
 def test_the_axis_of_a_camera_is_no_calibration(options: tuple[str, ...]) -> None:
-    refused = CliRunner().invoke(cli.app, ["calibrate", "--boresight", *options])
+    refused = CliRunner().invoke(cli.make_app(), ["calibrate", "--boresight", *options])
     assert refused.exit_code == 2 and "--boresight takes no option of a calibration" in refused.output
-    refused = CliRunner().invoke(cli.app, ["calibrate", "--region", "0,0,1,1"])
+    refused = CliRunner().invoke(cli.make_app(), ["calibrate", "--region", "0,0,1,1"])
     assert refused.exit_code == 2 and "are for --boresight" in refused.output
 
 
@@ -82,7 +82,7 @@ def test_a_fresh_start_that_was_interrupted_is_not_left_to_others(monkeypatch: p
     monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(FakeClient(CalibrationMsg())))
     monkeypatch.setattr(verb, "set_parameter", lambda _client, _node, _name, value: held.append(value))
     monkeypatch.setattr(verb, "expected_run", interrupted)
-    CliRunner().invoke(cli.app, ["calibrate", "--fresh"])
+    CliRunner().invoke(cli.make_app(), ["calibrate", "--fresh"])
     assert held == [True, False]
 
 
@@ -99,7 +99,7 @@ def test_a_poke_check_that_no_parameter_puts_right_says_what_becomes_of_the_file
     monkeypatch.setattr(verb, "nodes_of_suite", lambda _client: ())
     monkeypatch.setattr(verb, "run_calibration", failed)
     target = tmp_path / "found.yaml"
-    said = CliRunner().invoke(cli.app, ["calibrate", "--plan", "poke-check", "--write", str(target)])
+    said = CliRunner().invoke(cli.make_app(), ["calibrate", "--plan", "poke-check", "--write", str(target)])
     assert "found.yaml is not written" in said.output.replace("\n", "") and not target.exists()
     assert "correct" not in said.output  # nobody knows that of a check that failed
     assert said.exit_code == 1
@@ -238,7 +238,7 @@ def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch
         id="c1", wavelength=632.8e-9, held_out_max_zernike=2e-9, instrument_error=5e-9, scale_error=1e-9
     )
     monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(FakeClient(made)))
-    done = CliRunner().invoke(cli.app, ["calibrate", "--until", "2nm"])
+    done = CliRunner().invoke(cli.make_app(), ["calibrate", "--until", "2nm"])
     lines = done.output.splitlines()
     assert lines[0] == "expected: 110 maps in about 158 s, moves then accurate to 2.7 nm"
     assert [line for line in lines if "so far" in line] == [

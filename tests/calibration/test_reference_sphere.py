@@ -32,7 +32,7 @@ def test_the_bound_of_the_scale_is_that_of_the_instrument(
 
 @pytest.mark.parametrize("radius", ["0", "nan", "inf"])
 def test_what_is_no_radius_is_refused_before_a_map_is_taken(radius: str) -> None:
-    done = CliRunner().invoke(cli.app, ["measure", "--reference-sphere", radius])
+    done = CliRunner().invoke(cli.make_app(), ["measure", "--reference-sphere", radius])
     assert done.exit_code == 2 and f"--reference-sphere {radius}: must be a radius in m" in done.output
 
 
@@ -47,5 +47,5 @@ def test_the_map_of_a_sphere_is_published_to_nobody(sphere: bool, monkeypatch: p
     client = SimpleNamespace(measure=failing)
     monkeypatch.setattr(measure, "running_suite", lambda namespace: nullcontext(client))
     words = ["--reference-sphere", "2"] if sphere else []
-    assert CliRunner().invoke(cli.app, ["measure", *words]).exit_code == 1
+    assert CliRunner().invoke(cli.make_app(), ["measure", *words]).exit_code == 1
     assert calls == [sphere]

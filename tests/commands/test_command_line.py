@@ -52,7 +52,7 @@ def screen() -> Any:
 
 
 def parsed(verb: str, *words: str) -> dict[str, Any]:
-    group: Any = typer.main.get_command(cli.app)
+    group: Any = typer.main.get_command(cli.make_app())
     params: dict[str, Any] = group.commands[verb].make_context(verb, list(words)).params
     return params
 
@@ -103,7 +103,7 @@ def test_a_decimal_comma_is_understood_where_a_number_is_wanted(
 
 def test_what_is_mistyped_is_guessed_and_wrong_usage_is_2() -> None:
     wrong_verb, wrong_option = (
-        CliRunner().invoke(cli.app, words) for words in (["focuss", "1"], ["focus", "--dry-rn"])
+        CliRunner().invoke(cli.make_app(), words) for words in (["focuss", "1"], ["focus", "--dry-rn"])
     )
     assert wrong_verb.exit_code == wrong_option.exit_code == 2
     assert "Did you mean 'focus'" in wrong_verb.output and "--dry-run" in wrong_option.output
@@ -134,7 +134,7 @@ def test_the_bare_command_helps() -> None:
 
 
 def test_the_version_is_said() -> None:
-    said = CliRunner().invoke(cli.app, ["--version"])
+    said = CliRunner().invoke(cli.make_app(), ["--version"])
     assert said.exit_code == 0 and said.output.startswith("dm 0.")
 
 
@@ -154,7 +154,7 @@ def test_where_no_file_can_be_written_nothing_begins(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path, tmp_path / "file" / "below" / "f"):
         for words in (["status", "--json"], ["calibrate", "--write"], ["instrument", "flats", "t.csv", "--write"]):
-            refused = CliRunner().invoke(cli.app, [*words, str(path)])
+            refused = CliRunner().invoke(cli.make_app(), [*words, str(path)])
             assert refused.exit_code == 2 and f"{words[-1]}': {path}: must be a file" in refused.output.replace(
                 "\n", ""
             )
@@ -210,7 +210,7 @@ def test_exit_codes(
     def fails(*_words: Any, **_keywords: Any) -> None:
         raise error
 
-    monkeypatch.setattr(cli, "app", fails)
+    monkeypatch.setattr(cli, "make_app", fails)
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == code
@@ -225,7 +225,7 @@ def test_a_verb_that_is_interrupted_ends_with_130(error: BaseException, monkeypa
         raise error
 
     monkeypatch.setattr(verb_status, "running_suite", fails)
-    done = CliRunner().invoke(cli.app, ["status"])
+    done = CliRunner().invoke(cli.make_app(), ["status"])
     assert (done.exit_code, "error: interrupted" in done.output) == (130, True)
 
 
@@ -344,7 +344,7 @@ def test_a_map_is_held_against_what_is_promised_beyond_the_prediction(
     monkeypatch.setattr(check, "running_suite", lambda _namespace: nullcontext(client))
     monkeypatch.setattr(check, "nodes_of_suite", lambda _client: {"focus_controller": 1})
     monkeypatch.setattr(check, "receive_health", lambda _client: {"focus_controller": SimpleNamespace(values=pairs)})
-    said = CliRunner().invoke(cli.app, ["check", "--json", str(tmp_path / "figures")])
+    said = CliRunner().invoke(cli.make_app(), ["check", "--json", str(tmp_path / "figures")])
     assert said.exit_code == code, said.output
     assert f"largest coefficient beyond what is predicted: promised {promised:g} nm (95 % bound" in said.output
     assert json.loads((tmp_path / "figures").read_text())["check"]["promised_nm"] == pytest.approx(promised)
@@ -365,7 +365,7 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("words", [("--hysteresis-maps", "10"), ("--camera", "--hysteresis-maps", "0")])
 def test_maps_that_a_demo_cannot_take_are_refused_before_it_begins(words: tuple[str, ...]) -> None:
-    refused = CliRunner().invoke(cli.app, ["demo", *words])
+    refused = CliRunner().invoke(cli.make_app(), ["demo", *words])
     assert refused.exit_code == 2 and "--hysteresis-maps" in refused.output
 
 

@@ -52,7 +52,7 @@ def test_terms_that_are_none_are_refused(text: str) -> None:
 
 @pytest.mark.parametrize("words", [("--curvatures", "0.02"), ("--zernike", "coma sin=5"), ("--take-over",)])
 def test_a_list_builds_nothing(words: tuple[str, ...]) -> None:
-    refused = CliRunner().invoke(cli.app, ["recipes", "--list", *words])
+    refused = CliRunner().invoke(cli.make_app(), ["recipes", "--list", *words])
     assert refused.exit_code == 2 and f"--list and {words[0]}: only one of them" in refused.output
 
 

@@ -32,7 +32,7 @@ from dm_bringup.nodes import LAUNCH_ARGUMENTS
 from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
-from dm_tools.cli import app
+from dm_tools.cli import make_app
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
@@ -129,7 +129,7 @@ def docstrings(path: Path) -> Iterator[str]:
 @cache
 def dm_commands() -> dict[str, Any]:
     """The commands of `dm` by name."""
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(make_app())
     return dict(group.commands)
 
 

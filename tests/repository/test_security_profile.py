@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from dm_client import DeformableMirrorClient
 from dm_common.ros import qos
 from dm_common.ros.domains import own_domain
-from dm_tools.cli import app
+from dm_tools.cli import make_app
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.running_suite import receive_health
@@ -161,8 +161,8 @@ def test_permissions_that_do_not_keep_to_it(tmp_path: Path, file: str, old: str,
 
 def test_a_private_key_that_others_may_read_and_a_policy_that_was_changed(tmp_path: Path) -> None:
     folder = tmp_path / "keystore"
-    assert CliRunner().invoke(app, ["security", "--out", str(folder)]).exit_code == 0
-    assert CliRunner().invoke(app, ["security", "--check", str(folder)]).exit_code == 0
+    assert CliRunner().invoke(make_app(), ["security", "--out", str(folder)]).exit_code == 0
+    assert CliRunner().invoke(make_app(), ["security", "--check", str(folder)]).exit_code == 0
     key = folder / "private" / "ca.key.pem"
     key.touch(0o640)
     policy = folder / "policies" / "cli.policy.xml"
@@ -170,7 +170,7 @@ def test_a_private_key_that_others_may_read_and_a_policy_that_was_changed(tmp_pa
     found = check_keystore(folder, Profile())
     assert any("0640: a private key must be 0600" in line for line in found)
     assert any("cli.policy.xml: differs" in line and "actuator_command" in line for line in found)
-    assert CliRunner().invoke(app, ["security", "--check", str(folder)]).exit_code == 1
+    assert CliRunner().invoke(make_app(), ["security", "--check", str(folder)]).exit_code == 1
 
 
 def test_two_mirrors_share_a_keystore(tmp_path: Path) -> None:

@@ -133,8 +133,8 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def make_app() -> typer.Typer:
-    """Build the command with all verbs that are available."""
+def make_app(only: str = "") -> typer.Typer:
+    """Build the command with all verbs that are available, or with `only` this one, without importing the others."""
     app = typer.Typer(
         name="dm",
         cls=Group,
@@ -146,7 +146,7 @@ def make_app() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(verb(_options))
-    for name, module in VERBS.items():
+    for name, module in {only: VERBS[only]}.items() if only in VERBS else VERBS.items():
         try:
             function = getattr(importlib.import_module(module), name)
         except ModuleNotFoundError as error:
@@ -155,9 +155,6 @@ def make_app() -> typer.Typer:
         else:
             app.command(name=name, cls=Command, context_settings=SETTINGS.get(name))(verb(function))
     return app
-
-
-app = make_app()
 
 
 def _set_environment() -> None:
@@ -176,7 +173,7 @@ def run(words: list[str], name: str) -> None:
         if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
             signal.signal(number, signal.default_int_handler)
     try:
-        app(words, prog_name=name)
+        make_app(*words[:1])(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
         # The name in dm_msgs/ErrorCode, so that users can look it up or search a log for it.
         code = f"{ErrorCode(error.error_code).name}: " if isinstance(error, CodedError) else ""
