@@ -7,6 +7,7 @@ nonlinearly: slope of the Duhem operator, creep rate (variable projection [14]).
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -110,6 +111,8 @@ class CandidateProblem:
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
         self._scatter = scatter
         self._measured = run.responses.values / scatter
+        # Fits to other rows begin at the same slope and at the same steps from it; only one varies the creep rate.
+        self._fading = lru_cache(2 * self.candidate.slopes)(self._fading_of)
 
     def fit(self, keep: Bools, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
         """Fit to the rows in `keep` (M,), starting from `start` or, without it, from a guess.
@@ -122,13 +125,22 @@ class CandidateProblem:
         if start is not None:
             guess = np.append(start.law.duhem_slope, start.law.creep_rate)
         weights: list[Floats | None] = [None]
+        free = basis_of(self.run.figure[keep])
+        measured = without(self._measured[keep], free)
+
+        def solve(features: Floats) -> tuple[Floats, Floats]:
+            """Weights (F,), residual (M, D) in units of the scatter."""
+            begin = np.eye(features.shape[1])[0] if weights[0] is None else weights[0]
+            found = _alternate(without(features[keep], free), measured, begin) if len(begin) > 1 else begin
+            left = self.run.gains(np.einsum("f,mfn->mn", found, features), keep)[1]
+            return found, left / self._scatter
 
         def residual(nonlinear: Floats) -> Floats:
             try:
                 features = self._features(nonlinear)
             except ValueError:  # coefficients that give no valid Duhem operator
                 return np.full(int(keep.sum()) * self._measured.shape[1], 1e3)
-            weights[0], left = self._solve(features, keep, weights[0])
+            weights[0], left = solve(features)
             return np.asarray(left[keep].ravel())
 
         found = least_squares(
@@ -142,12 +154,12 @@ class CandidateProblem:
             ftol=1e-6,
         )
         nonlinear, still = found.x, np.append(found.x[:-1], 0.0)
-        without, least = float(np.square(residual(still)).sum()), CREEP_SHOWN
+        static, least = float(np.square(residual(still)).sum()), CREEP_SHOWN
         if not self.candidate.hysteretic:
-            least = max(least, CREEP_SHARE * without)
-        if without - 2.0 * found.cost < least:
+            least = max(least, CREEP_SHARE * static)
+        if static - 2.0 * found.cost < least:
             nonlinear = still
-        solved, left = self._solve(self._features(nonlinear), keep, weights[0])
+        solved, left = solve(self._features(nonlinear))
         return LawFit(self.candidate, self._law(solved, nonlinear), left * self._scatter)
 
     def _features(self, nonlinear: Floats) -> Floats:
@@ -155,19 +167,13 @@ class CandidateProblem:
         features = self._plays + rate * self._plays_crept
         if not self.candidate.slopes:
             return features
-        fading = self.run.fading(FadingHysteresis(slope))
-        fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
-        return np.concatenate((features, fading), axis=1)
+        fading, crept = self._fading(tuple(slope))
+        return np.concatenate((features, fading + rate * crept), axis=1)
 
-    def _solve(self, features: Floats, keep: Bools, weights: Floats | None) -> tuple[Floats, Floats]:
-        """Weights (F,), residual (M, D) in units of the scatter."""
-        if weights is None:
-            weights = np.eye(features.shape[1])[0]
-        if len(weights) > 1:
-            free = basis_of(self.run.figure[keep])
-            weights = _alternate(without(features[keep], free), without(self._measured[keep], free), weights)
-        _, left = self.run.gains(np.einsum("f,mfn->mn", weights, features), keep)
-        return weights, left / self._scatter
+    def _fading_of(self, slope: tuple[float, ...]) -> tuple[Floats, Floats]:
+        """(M, 1, N) values of the Duhem operator with `slope`, and their creep per unit of creep rate."""
+        fading = self.run.fading(FadingHysteresis(np.array(slope)))
+        return fading, np.tensordot(self.run.creep, fading, 1)
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
         radius, plays = self.candidate.radius, self._plays.shape[1]
