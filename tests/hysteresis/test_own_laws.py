@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _few_maps, _remarks, _without_outliers
 from dm_calibration.hysteresis.identify import Identification, identify
@@ -53,6 +55,7 @@ class Relays:
         return np.asarray((1.0 - self._share) * signals + self._share * relays)
 
 
+@cache
 def relay_run(spread: float, seed: int, maps: int = 200, creep: float = 0.01) -> tuple[Run, NDArray[np.bool_]]:
     """A run of the excitation on seven such actuators that creep, seen through a random matrix, and its check maps."""
     mirror = make_mirror(rings=1)
@@ -75,6 +78,12 @@ def relay_run(spread: float, seed: int, maps: int = 200, creep: float = 0.01) ->
     return Run(commands.signals, time, responses, 0.0), commands.check
 
 
+@cache
+def identified(spread: float, seed: int, laws: Sequence[Candidate], maps: int = 200) -> Identification:
+    """Of :func:`relay_run`."""
+    return identify(*relay_run(spread, seed, maps), laws)
+
+
 def held_out_rms(found: Identification) -> float:
     return float(np.sqrt(np.nanmean(np.square(found.held_out))))
 
@@ -85,8 +94,7 @@ def says_alike(found: Identification) -> bool:
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(seed: int) -> None:
-    run, check = relay_run(0.2, seed)
-    found, common = identify(run, check, LAWS), identify(run, check, COMMON)
+    found, common = identified(0.2, seed, LAWS), identified(0.2, seed, COMMON)
     assert found.fit.candidate.own
     assert not says_alike(found) and not says_alike(common)
     assert found.fit.law.actuators == 7
@@ -95,8 +103,7 @@ def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(se
 
 
 def test_actuators_that_are_alike_lose_nothing() -> None:
-    run, check = relay_run(0.0, 13)
-    assert held_out_rms(identify(run, check, LAWS)) < 1.1 * held_out_rms(identify(run, check, COMMON))
+    assert held_out_rms(identified(0.0, 13, LAWS)) < 1.1 * held_out_rms(identified(0.0, 13, COMMON))
 
 
 def test_maps_of_another_surface_are_found_though_the_laws_follow_them() -> None:
@@ -107,7 +114,7 @@ def test_maps_of_another_surface_are_found_though_the_laws_follow_them() -> None
     values[wrong] += 3e-8 * rng.standard_normal((10, values.shape[1]))
     found, kept = _without_outliers(replace(run, responses=replace(run.responses, values=values)), check, LAWS)
     np.testing.assert_array_equal(np.flatnonzero(~kept.responses.usable), np.sort(wrong))
-    assert held_out_rms(found) < 1.2 * held_out_rms(identify(run, check, LAWS))
+    assert held_out_rms(found) < 1.2 * held_out_rms(identified(0.2, 11, LAWS))
 
 
 def test_maps_too_few_to_tell_the_loops_apart_are_said_to_be() -> None:
@@ -168,9 +175,9 @@ def test_a_final_fit_that_cannot_be_inverted_is_not_taken(monkeypatch: pytest.Mo
 
 
 def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_nothing() -> None:
-    run, check = relay_run(0.2, 14, 120)
+    run, _check = relay_run(0.2, 14, 120)
     preisach = next(law for law in CANDIDATES if law.name == "Preisach, each actuator its own")
-    start, scatter = identify(run, check, COMMON).fit.law, np.full(12, NOISE)
+    start, scatter = identified(0.2, 14, COMMON, 120).fit.law, np.full(12, NOISE)
     free, keep = OwnLaws(run, preisach, start, scatter, -np.inf), np.ones(120, dtype=bool)
     as_found = free.fit(keep)
     steep = slope_min(as_found.law, *run.reach)
@@ -191,9 +198,9 @@ def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_n
 
 def test_a_law_far_too_flat_is_drawn_towards_the_others_which_keep_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
     """For one of 37 that fell to -2.7 where no map came all lost theirs: 30 nm in moves held out, now 11."""
-    run, check = relay_run(0.2, 14, 120)
+    run, _check = relay_run(0.2, 14, 120)
     preisach = next(law for law in CANDIDATES if law.name == "Preisach, each actuator its own")
-    start, scatter = identify(run, check, COMMON).fit.law, np.full(12, NOISE)
+    start, scatter = identified(0.2, 14, COMMON, 120).fit.law, np.full(12, NOISE)
     keep, flattest = np.ones(120, dtype=bool), 2
     far = list[float]()
 
