@@ -181,7 +181,7 @@ PARSED = {
     "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",
     "./dm compare --hysteresis --plant all": _LONG + "test_ablation.py runs its parts",
     "./dm compare --hysteresis --plant all --seed 51 --seed 52 --seed 53": _LONG + "test_ablation.py runs its parts",
-    "./dm compare --mirrors 30 --seed 7684": _LONG + "test_compare_mirrors.py runs its parts",
+    "./dm compare --mirrors 30 --seed 7743": _LONG + "test_compare_mirrors.py runs its parts",
     "./dm compare --mirrors 2 --quick": _LONG + "test_compare_mirrors.py runs its parts",
     "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
