@@ -68,8 +68,8 @@ def checks_section(calibration: Calibration, checks: Sequence[Check], values: Ma
     outside = sum(check.accepted and check.max_zernike > promised for check in checks)
     sentences = [
         f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "
-        f"{sum(not check.accepted for check in checks)} disagreed; of the others {outside} showed more than the promise "
-        f"of {length(promised, calibration.wavelength)}: one in twenty may.",
+        f"{sum(not check.accepted for check in checks)} disagreed; of the others {outside} showed more than the "
+        f"promise of {length(promised, calibration.wavelength)}: one in twenty may.",
         f"In {days:.1f} days gains have changed by up to {last.gain_drift:.2%} (actuator {last.actuator}), the figure "
         f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows, until its updates are forgotten "
         "(./dm check --forget).",
