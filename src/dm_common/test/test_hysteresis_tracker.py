@@ -77,6 +77,19 @@ def test_a_degauss_cures(tracker: HysteresisTracker) -> None:
     np.testing.assert_array_equal(tracker.state.play, LAW.demagnetised(2, 9.0).play)
 
 
+def test_creep_before_a_degauss_is_kept_if_no_swing_was_seen(tracker: HysteresisTracker) -> None:
+    """The shape was held until the last report, however long before the move to it began."""
+    tracker.observe(report(10.0, 0.1 * A, 2, REST, moving=True, requested=A))
+    tracker.observe(report(10.5, A, 2, REST))
+    assert tracker.state is not None
+    held = tracker.state
+    tracker.last = report(10.5, A, 2, REST, heard=3600.0)  # as the observer does with reports that repeat the last
+    tracker.observe(report(3605.0, REST, 3, REST, degausses=2))
+    expected = LAW.advance(LAW.degaussed(held, 3600.0), 3605.0)
+    np.testing.assert_allclose(LAW.effective(tracker.state), LAW.effective(expected), atol=1e-12)
+    assert not tracker.unknown
+
+
 def test_lost_writes_are_noticed(tracker: HysteresisTracker) -> None:
     tracker.observe(report(2.0, A, 2, REST, history_known=False))
     assert "writes were lost" in tracker.unknown

@@ -105,8 +105,9 @@ class HysteresisTracker:
     def _degaussed(self, report: Applied, last: Applied) -> None:
         """Begin a new history; moves since the degauss are known if there was at most one turn."""
         assert self.state is not None
-        # During the swings about the middle, creep follows the middle.
-        began, self._set_off = self._set_off or self.state, None
+        # During the swings about the middle, creep follows the middle; if none was seen, from the last report onwards.
+        unseen = self.law.advance(self.state, min(self._seen, report.time))
+        began, self._set_off = (self._set_off if last.moving else None) or unseen, None
         self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
         # The end of the degauss counts as a turn, and so does a move that was abandoned for it.
         seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
