@@ -222,7 +222,7 @@ class FocusController:
         if (before := self.monitor.order) is not None and before.command is not None:
             if not before.answered:
                 effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
-            order.previous_order = before if before.command.confirmed else before.previous_order
+            order.previous_order = before if before.applied else before.previous_order
         self.monitor.order = order
         return effects
 

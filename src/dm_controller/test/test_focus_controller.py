@@ -947,6 +947,21 @@ def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) ->
     assert (values["curvature"], values["held"]) == (0.02, True)
 
 
+def test_a_request_that_fails_while_a_correction_is_on_its_way_leaves_the_shape_held(bench: Bench) -> None:
+    order = bench.ask(0.02)
+    bench.wait(0.3)
+    bench.obeys, sent = False, len(bench.commands)
+    bench.wait(0.2)
+    correction = bench.commands[sent]
+    bench.ask(0.01)
+    bench.obeys = True
+    bench.move(correction.signals)  # the driver takes the correction, and not the request
+    bench.wait(6.0)
+    assert bench.refusal().error_code == ErrorCode.PREEMPTED
+    assert bench.controller.monitor.order is order and bench.controller.hold.active
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
 def test_a_clock_that_jumps_while_a_command_is_on_its_way_leaves_its_shape_held(bench: Bench) -> None:
     """As does simulated time that runs fast: how long the driver may take is a matter of the steady clock."""
     bench.obeys = False
