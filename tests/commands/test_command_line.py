@@ -57,6 +57,14 @@ def parsed(verb: str, *words: str) -> dict[str, Any]:
     return params
 
 
+def test_only_the_verb_that_is_asked_for_is_imported() -> None:
+    code = (
+        "import sys; from dm_tools import cli; app = cli.make_app('status'); "
+        "print(len(app.registered_commands), 'dm_tools.verbs.calibrate' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["1", "False"]
+
+
 @pytest.mark.parametrize(
     ("library", "module", "use", "text"),
     [

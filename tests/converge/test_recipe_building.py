@@ -266,3 +266,9 @@ def test_no_more_maps_are_taken_than_limits_leave_to_correct() -> None:
     best = RecipeBuilder(tight, plant, lambda: plant.time, replace(options, tolerance=1e-12)).build(FocusTarget(0.02))
     assert best.max_zernike > 2e-9 and recipe.max_zernike < best.max_zernike + 1e-9
     assert recipe.maps <= 9
+
+
+def test_noise_is_not_what_limits_leave() -> None:
+    """All of the error can be corrected, so building goes on although the mean is not within the tolerance."""
+    plant = LinearPlant(GAINS, noise=2e-9)
+    assert build(plant, BuildOptions(tolerance=2e-10, maps_max=24, average=4)).maps == 24

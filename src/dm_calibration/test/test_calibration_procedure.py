@@ -323,7 +323,7 @@ def test_a_clock_set_back_spoils_no_run(back_s: int, bench: LinearBench, mirror:
 
     procedure = Procedure(plan, mirror, bench, outcome=outcome, progress=set_back)
     if back_s > 10:
-        with pytest.raises(Refusal, match="s before that of the map before it: must be later; was the clock set back"):
+        with pytest.raises(Refusal, match="that of the map before it: must not be earlier; was the clock set back"):
             procedure.run()
         bench.clock_ns += back_s * 10**9
         procedure = Procedure(plan, mirror, bench, outcome=outcome)

@@ -50,11 +50,11 @@ def write_whole(path: Path, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.unlink(missing_ok=True)  # left by a killed process that had the same id
         with temporary.open("xb") as file:
+            with suppress(OSError):  # a new file; some file systems know no permissions
+                shutil.copymode(path, temporary)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        with suppress(OSError):  # a new file; some file systems know no permissions
-            shutil.copymode(path, temporary)
         temporary.replace(path)
     except OSError:
         with suppress(OSError):

@@ -638,7 +638,7 @@ def test_a_poke_has_settled_when_its_map_is_taken() -> None:
         asked.append((name, time.monotonic()))
         return Measure.Response(zernike=ZernikeCoefficients(coefficients=[0.0] * 21))
 
-    session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=None, poked=None, snapshot=bench)
+    session: Any = SimpleNamespace(ros=SimpleNamespace(call=call), base=None, snapshot=bench)
     assert "Map: rms" in asyncio.run(operations.poke(session, 1, 0.1, then_measure=True))
     (first, moved), (second, taken) = asked
     assert (first, second) == ("set_signals", "measure") and taken - moved >= operations.SETTLE_S

@@ -111,7 +111,7 @@ class CandidateProblem:
         self._plays_crept = np.tensordot(run.creep, self._plays, 1)
         self._scatter = scatter
         self._measured = run.responses.values / scatter
-        # Fits to other rows begin at the same slope and at the same steps from it; only one varies the creep rate.
+        # Fits to other rows begin at the same slope and take the same steps from it; creep leaves it as it is.
         self._fading = lru_cache(2 * self.candidate.slopes)(self._fading_of)
 
     def fit(self, keep: Bools, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:

@@ -24,7 +24,7 @@ OUTLIER_ROUNDS = 4
 CREPT_MAX = 1.5
 #: Number of maps beyond that of the actuators (122 maps for 37) from which on held-out moves show how well laws of each
 #: actuator predict requests. With fewer the bound is raised by a third power: without that, 85 % of the requests to two
-#: mirrors of nine were inside it with 75 maps beyond, 95 % within 1.2 times the bound; with 53 beyond, 40 to 50 % of
+#: mirrors of ten were inside it with 75 maps beyond, 95 % within 1.2 times the bound; with 53 beyond, 40 to 50 % of
 #: the requests to three mirrors, and 90 % within 2.1 to 2.9 times the bound.
 MAPS_BEYOND, FEWER = 85, 3
 #: A test move counts as held if its map comes this much later after it than the median, s; fewest that count.

@@ -84,8 +84,8 @@ def forecast(
     duration = float(time[-1]) if len(time) else 0.0
     expected = Forecast(duration, 0.0)
     tested = any(step.kind is StepKind.CHECK for step in plan.steps)
-    drawn = earlier is None or earlier.hysteresis is None
-    if not tested or (drawn and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
+    typical = earlier is None or earlier.hysteresis is None
+    if not tested or (typical and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
         return expected
     law = error_after_one_map(earlier, mirror)
     for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):

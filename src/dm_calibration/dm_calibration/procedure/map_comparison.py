@@ -29,7 +29,7 @@ def check_comparable(
         raise MeasurementError(ErrorCode.MAP_REJECTED, different)
 
 
-def check_rising(measured: Measurement, outcome: Outcome) -> None:
+def check_not_earlier(measured: Measurement, outcome: Outcome) -> None:
     """Refuse a map that is dated before the last one of `outcome`: creep cannot be identified then.
 
     Raises:
@@ -37,8 +37,11 @@ def check_rising(measured: Measurement, outcome: Outcome) -> None:
     """
     back = 1e-9 * (outcome.records[-1].stamp_ns - measured.stamp_ns) if outcome.records else 0.0
     if back > 0.0:
-        text = f"its stamp is {back:.3f} s before that of the map before it: must be later; was the clock set back?"
-        raise MeasurementError(ErrorCode.MAP_REJECTED, f"{text} Correct it before the run is resumed")
+        raise MeasurementError(
+            ErrorCode.MAP_REJECTED,
+            f"its stamp is {back:.3f} s before that of the map before it: must not be earlier; was the clock set back? "
+            "Set it right before the goal is sent again, else the run is set aside",
+        )
 
 
 def _difference(measured: Measurement, outcome: Outcome, working_radius: float, tolerance: float) -> str:

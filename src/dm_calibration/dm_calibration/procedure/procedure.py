@@ -14,7 +14,7 @@ from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
-from dm_calibration.procedure.map_comparison import check_comparable, check_rising
+from dm_calibration.procedure.map_comparison import check_comparable, check_not_earlier
 from dm_calibration.procedure.outcome import (
     Doubted,
     Dropped,
@@ -269,7 +269,7 @@ class Procedure:
         self._guard()
         check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
         if self._plan.kind is PlanKind.HYSTERESIS:
-            check_rising(measured, self.outcome)
+            check_not_earlier(measured, self.outcome)
         if self.outcome.setup is None:
             self._note(Setup.of(measured))
         assert step.signals is not None

@@ -83,6 +83,8 @@ class UnfinishedRuns:
         """
         found, others = list[Kept](), list[str]()
         for folder in self._runs():
+            if os.access(folder, os.R_OK | os.X_OK) and not (folder / MANIFEST).exists():
+                continue  # what is left of a finished run
             try:
                 theirs = read_manifest(folder)["identity"]
                 kept = read_run(folder, remarks) if theirs == identity else None
@@ -122,8 +124,5 @@ class UnfinishedRuns:
         return [
             path
             for path in self.folder.iterdir()
-            if (path / MANIFEST).is_file()
-            and not path.is_symlink()
-            and not path.name.startswith(".")
-            and path.suffix != ASIDE
+            if path.is_dir() and not path.is_symlink() and not path.name.startswith(".") and path.suffix != ASIDE
         ]

@@ -135,14 +135,11 @@ class StopOnSignals:
 
 
 class BackgroundExecutor:
-    """Serves a node from a thread of its own, for programs that are not nodes themselves.
+    """Serves a node from a thread of its own, for programs that are not nodes themselves."""
 
-    `executor`: one that has the node already; None = the suite's.
-    """
-
-    def __init__(self, node: Node, executor: Executor | None = None) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._executor = executor or make_executor(node)
+        self._executor = make_executor(node)
         self._stop = False
         self._thread = threading.Thread(target=spin, args=(self._executor, lambda: self._stop), daemon=True)
         self._thread.start()

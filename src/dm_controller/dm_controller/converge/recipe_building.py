@@ -29,6 +29,8 @@ from dm_controller.solvers.base import Shape, measured_shape, rms_sag
 MISS_IGNORED = 1e-3
 #: A round ends once the standard error of its mean is this share of the tolerance; fewest maps to find that error from.
 SURE_SHARE, MAPS_MIN = 0.2, 3
+#: Share of the tolerance above what a perfect correction leaves at which nothing is left to correct.
+ENOUGH_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -138,10 +140,8 @@ class RecipeBuilder:
             maps += taken.maps
             aim = taken.aim
             error = self._error(taken).max_zernike
-            # What limits and number of actuators leave even of a perfect correction.
-            least = self._error(replace(taken, aim=self._solve(target, aim))).max_zernike
-            least = least if least > options.tolerance else 0.0
-            if error <= least + options.tolerance or maps + options.average > options.maps_max:
+            enough = max(options.tolerance, self._least(taken) + ENOUGH_SHARE * options.tolerance)
+            if error <= enough or maps + options.average > options.maps_max:
                 self._built.append((taken, maps))
                 return self._recipe(taken, maps)
 
@@ -170,6 +170,13 @@ class RecipeBuilder:
     def _error(self, taken: _Round) -> Shape:
         """The surface measured in a round, minus the wanted one."""
         return self._predicted(taken.aim) + taken.defect - target_shape(taken.target, self._loop.mirror.model)
+
+    def _least(self, taken: _Round) -> float:
+        """The error (m) that limits and number of actuators leave even of a perfect correction."""
+        mirror = self._loop.mirror
+        wanted, tilt = mirror.wanted(taken.target)
+        best = mirror.solve(mirror.rows(wanted - taken.defect, tilt))
+        return float(self._error(replace(taken, aim=best)).max_zernike)
 
     def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
         """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without a defect."""

@@ -125,7 +125,7 @@ class FocusTarget:
             text = "no curvature is reachable" + (
                 " with these added Zernike terms"
                 if any(self.zernike)
-                else ": the initial figure takes more than the limits permit, or than so few actuators can do; check "
+                else ": the initial figure takes more than the limits permit, or than the actuators can form; check "
                 "limits.signal_min, limits.signal_max and limits.neighbour_difference of pdm_driver, or allow a larger "
                 "error (reachable_tolerance of focus_controller)"
             )

@@ -8,7 +8,6 @@ import numpy as np
 
 from dm_common.hysteresis.law_shape import closed_cycle, opening
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.optics.piston_tilt import weighted_fit
 from dm_tools.console.view_models import moved
 
 #: Points of each branch of a loop.
@@ -86,7 +85,9 @@ def effective_change(before: Any, after: Any, calibration: Any, actuator: int) -
         raise ValueError(f"the map was sampled at {x.size} points, not at the {points} of the calibration")
     change = np.array(after.sag) - np.array(before.sag)
     response = np.array(calibration.influence_sag).reshape(points, count)[:, actuator - 1]
-    if not response.any():
+    good = np.isfinite(change)
+    root = np.sqrt(np.array(calibration.sample_weight)[good])
+    columns = np.column_stack([response, np.ones(points), x, y])[good] * root[:, None]
+    if not np.linalg.norm(columns[:, 0]) > 0.0:
         raise ValueError(f"actuator {actuator} does nothing to the surface of this calibration")
-    columns = np.column_stack([response, np.ones(points), x, y])
-    return float(weighted_fit(change[None], columns, np.array(calibration.sample_weight))[0, 0])
+    return float(np.linalg.lstsq(columns, change[good] * root, rcond=None)[0][0])

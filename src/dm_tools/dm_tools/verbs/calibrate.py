@@ -48,14 +48,14 @@ def run_calibration(client: Any, goal: Any) -> Any:
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
-        said, reached = ("", 0), 0.0
+        said, reached = set[tuple[str, int]](), 0.0
 
         def show(feedback: Any) -> None:
-            nonlocal said, reached
+            nonlocal reached
             text = calibration_step(feedback)
             phase, tenth = text.split()[0].rstrip(","), 10 * feedback.step // max(feedback.steps, 1)
-            if not console.is_terminal and (phase, tenth) != said:  # no bar is drawn
-                said = phase, tenth
+            if not console.is_terminal and (phase, tenth) not in said:  # no bar is drawn
+                said.add((phase, tenth))
                 console.print(f"calibration: {phase}, step {feedback.step} of {feedback.steps}")
             if feedback.reached_max_zernike != reached:
                 reached = feedback.reached_max_zernike
