@@ -26,6 +26,8 @@ LEFT_MAX = 3e-8
 LEFT_SHARE, LEFT_NOISE = 0.3, 3e-9
 #: Fewest maps, and fewest points of a grid: enough for residuals that show the quality of the result.
 MAPS_MIN, POINTS_MIN = 5, 8
+#: Condition of a derivative by differences from which on its columns count as dependent.
+CONDITION_MAX = 1e6
 #: A grid is refused if its bound on scale or distortion reaches this value, the largest that the node accepts.
 UNCERTAIN_MAX = 0.1
 
@@ -172,5 +174,7 @@ def _similarity(seen: NDArray[np.complex128], place: NDArray[np.complex128]) -> 
     found = least_squares(apart, (1.0, 0.0, 0.0, 0.0, 0.0))
     variance = 2.0 * found.cost / (2 * len(seen) - 5)
     unit = np.array((size, size, size, size, 1.0))
-    covariance = variance * np.linalg.inv(found.jac.T @ found.jac) * np.outer(unit, unit)
+    covariance = np.full((5, 5), np.inf)
+    if np.linalg.cond(found.jac) < CONDITION_MAX:
+        covariance = variance * np.linalg.inv(found.jac.T @ found.jac) * np.outer(unit, unit)
     return found.x * unit, covariance, float(np.sqrt(2.0 * found.cost / len(seen)))
