@@ -109,9 +109,8 @@ class CalibrateAction:
         if goal.dry_run:
             maps = expected.maps or sum(step.takes_map for step in plan.steps)
             guess = "" if taken or in_use is not None else f" if a map takes {guessed:g} s (none was taken yet)"
-            typical = in_use is None or in_use.hysteresis is None
             time_text = f"{maps} maps in about {expected.duration:.0f} s{guess}"
-            result.message = f"{time_text}{expected.accuracy(goal.until, typical)}; nothing was moved"
+            result.message = f"{time_text}{expected.accuracy(goal.until)}; nothing was moved"
 
     def _run_kept(self, runs: UnfinishedRuns) -> None:
         """Begin or resume a run, store each map at once, and conclude. Fills the result, even after a failure."""

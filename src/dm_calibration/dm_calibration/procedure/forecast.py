@@ -29,26 +29,28 @@ WORST_LAW = 2.2
 
 @dataclass(frozen=True)
 class Forecast:
-    """Expected duration, s; expected error of moves, m, as `HysteresisFit.held_out_max_zernike`, 0 = not known; and
-    expected number of maps, 0 = all of the plan.
+    """Expected duration and accuracy of a plan.
+
+    Attributes:
+        duration: s.
+        max_zernike: m, error of moves, as `HysteresisFit.held_out_max_zernike`; 0 = not known.
+        maps: number of maps; 0 = all of the plan.
+        typical: whether `max_zernike` is that of mirrors drawn at random: the law of this one was never measured.
     """
 
     duration: float
     max_zernike: float
     maps: int = 0
+    typical: bool = False
 
-    def accuracy(self, until: float, drawn: bool) -> str:
-        """A phrase on the expected accuracy, compared with the goal `until` (m; 0 = no goal); "" = it is not known.
-
-        Args:
-            drawn: this mirror was never calibrated, so the value is that of mirrors drawn at random.
-        """
+    def accuracy(self, until: float) -> str:
+        """A phrase on the expected accuracy, compared with the goal `until` (m; 0 = no goal); "" = it is not known."""
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
         source = (
             ", median of mirrors drawn at random; one in ten errs twice as much, other kinds of mirrors more"
-            if drawn
+            if self.typical
             else ""
         )
         reached = distinct_from(self.max_zernike, until if missed else 0.0)
@@ -89,7 +91,7 @@ def forecast(
         return expected
     law = error_after_one_map(earlier, mirror)
     for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):
-        expected = Forecast(float(time[part - 1]), float(law / np.sqrt(part)), part)
+        expected = Forecast(float(time[part - 1]), float(law / np.sqrt(part)), part, typical)
         if expected.max_zernike <= until:
             break
     return expected
