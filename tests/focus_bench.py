@@ -151,7 +151,7 @@ def recipe(curvature: float, effective: NDArray[np.float64]) -> Recipe:
 
 def recipe_book(*recipes: Recipe) -> RecipeBookMsg:
     """Of the calibration here; recipes that begin with a degauss of 60 half-swings."""
-    return recipe_book_message(RecipeBook(recipes, 60, 1e-10, 0), "known")
+    return recipe_book_message(RecipeBook(recipes, 60, 1e-10), "known")
 
 
 def calibration_with_history(law: HysteresisModel, **fields: Any) -> Calibration:

@@ -259,8 +259,8 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             ),
             f"recipes: {{calibration_id: IN_USE, degauss_steps: 0, recipes: [{{{_RECIPE}}}]}}",
             "recipes: {calibration_id: IN_USE, degauss_steps: 100, interpolation_error: .nan}",
-            "recipes: {calibration_id: IN_USE, stamp: {sec: 1}, degauss_steps: 100, interpolation_error: 1.0e-9, "
-            f"recipes: [{{curvature: 0.03, conic_constant: -1.0, maps: 4, {_RECIPE}}}]}}",
+            "recipes: {calibration_id: IN_USE, degauss_steps: 100, interpolation_error: 1.0e-9, "
+            f"recipes: [{{stamp: {{sec: 1}}, curvature: 0.03, conic_constant: -1.0, maps: 4, {_RECIPE}}}]}}",
         ),
     ),
     "get_focus_range": (srv.GetFocusRange, ("",)),

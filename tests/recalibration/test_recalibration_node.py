@@ -291,7 +291,7 @@ def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
     before = np.array(suite.calibration.influence_sag)
     books = suite.observer.record(RecipeBookMsg, "recipes", qos.LATCHED)
     values = np.linspace(-0.5, 0.5, suite.bench.mirror.actuators)
-    book = RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10, 7)
+    book = RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10)
     message = recipe_book_message(book, suite.calibration.id)
     stored = suite.observer.call(StoreRecipes, "store_recipes", StoreRecipes.Request(recipes=message))
     assert stored.error_code == ErrorCode.OK, stored.message

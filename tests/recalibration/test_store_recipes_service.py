@@ -23,7 +23,7 @@ from support import NodeProcess, Observer, wait_until
 
 def book(actuators: int) -> RecipeBook:
     values = np.linspace(-0.5, 0.5, actuators)
-    return RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10, 7)
+    return RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10)
 
 
 def test_recipes_are_stored_and_published_again(

@@ -315,8 +315,8 @@ def test_residuals_are_those_of_the_fit(calibration: Calibration) -> None:
 def test_hysteresis_and_recipes_are_shown(calibration: Calibration) -> None:
     hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ("Chosen of four.",))
     astigmatism = (*4 * (0.0,), 2e-7, *16 * (0.0,))
-    recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4, astigmatism)
-    whole = replace(calibration, hysteresis=hysteresis, recipes=RecipeBook((recipe,), 100, 0.8e-9, 10**18))
+    recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4, astigmatism, stamp_ns=10**18)
+    whole = replace(calibration, hysteresis=hysteresis, recipes=RecipeBook((recipe,), 100, 0.8e-9))
     made = [content.summary(whole), content_hysteresis.hysteresis(whole), content_hysteresis.recipes(whole)]
     text = html_page("", made)
     for expected in (

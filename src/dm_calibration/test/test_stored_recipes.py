@@ -59,7 +59,7 @@ def book(*curvatures: float, actuators: int = ACTUATORS, steps: int = 100, maps:
         values = np.linspace(-1.0, 1.0, actuators)
         return Recipe(curvature, 0.0, values, values, 3e-10, 1e-9, maps)
 
-    return RecipeBook(tuple(recipe(curvature) for curvature in curvatures), steps, 1e-10, 5)
+    return RecipeBook(tuple(recipe(curvature) for curvature in curvatures), steps, 1e-10)
 
 
 def raw_data(file: Path) -> dict[str, bytes]:

@@ -256,11 +256,14 @@ _ARRAYS, _NUMBERS = (
 def recipe_book_message(book: RecipeBook, calibration_id: str) -> RecipeBookMsg:
     """Recipes of a calibration as a message."""
     recipes = [
-        RecipeMsg(**vars(recipe) | {name: doubles(np.array(getattr(recipe, name))) for name in _ARRAYS})
+        RecipeMsg(
+            stamp=time_message(recipe.stamp_ns),
+            **taken(recipe, *_NUMBERS),
+            **{name: doubles(np.array(getattr(recipe, name))) for name in _ARRAYS},
+        )
         for recipe in book.recipes
     ]
     return RecipeBookMsg(
-        stamp=time_message(book.stamp_ns),
         calibration_id=calibration_id,
         degauss_steps=book.degauss_steps,
         interpolation_error=book.interpolation_error,
@@ -280,8 +283,9 @@ def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
             signals=np.array(recipe.signals, dtype=np.float64),
             zernike=tuple(recipe.zernike),
             by_model=np.array(recipe.by_model, dtype=np.float64),
+            stamp_ns=stamp_ns(recipe.stamp),
             **taken(recipe, *_NUMBERS),
         )
         for recipe in message.recipes
     ]
-    return RecipeBook(tuple(recipes), message.degauss_steps, message.interpolation_error, stamp_ns(message.stamp))
+    return RecipeBook(tuple(recipes), message.degauss_steps, message.interpolation_error)

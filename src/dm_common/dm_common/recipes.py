@@ -38,6 +38,7 @@ class Recipe:
         zernike: m, added sag, as requested; () = none.
         by_model: (N,) effective signals that the calibration gave for the shape when the recipe was built, so that
             later changes of the calibration can shift the recipe; empty = not known.
+        stamp_ns: when it was built.
     """
 
     curvature: float
@@ -49,6 +50,7 @@ class Recipe:
     maps: int
     zernike: tuple[float, ...] = ()
     by_model: Floats = field(default_factory=lambda: np.zeros(0))
+    stamp_ns: int = 0
 
     @property
     def series(self) -> tuple[float, tuple[float, ...]]:
@@ -70,13 +72,11 @@ class RecipeBook:
         degauss_steps: half-swings of the degauss before each; kept when recipes are withheld.
         interpolation_error: m, how far the error bound halfway between two recipes exceeds the re-measured error, when
             the last recipes were built.
-        stamp_ns: when the last recipe was built.
     """
 
     recipes: tuple[Recipe, ...]
     degauss_steps: int
     interpolation_error: float
-    stamp_ns: int
 
     def __post_init__(self) -> None:
         shapes = [recipe.shape for recipe in self.recipes]
@@ -154,4 +154,4 @@ def shape_text(shape: Any) -> str:
     return f"{curvature} with {terms}" if terms else curvature
 
 
-NO_RECIPES = RecipeBook((), 0, 0.0, 0)
+NO_RECIPES = RecipeBook((), 0, 0.0)

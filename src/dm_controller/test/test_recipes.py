@@ -87,7 +87,7 @@ def added(**terms: float) -> tuple[float, ...]:
 
 
 def book(*recipes: Recipe) -> RecipeBook:
-    return RecipeBook(tuple(sorted(recipes, key=lambda each: each.shape)), 100, 0.0, 0)
+    return RecipeBook(tuple(sorted(recipes, key=lambda each: each.shape)), 100, 0.0)
 
 
 PLANNER: Any = StandIn(1e-9)
@@ -118,11 +118,22 @@ def test_what_the_calibration_has_learnt_since_moves_recipes_too() -> None:
     moved = 0.01 * np.random.default_rng(5).standard_normal(ACTUATORS)
     learnt.mirror.command = lambda target: (own(target) + moved, 0.0)
     for curvature in (0.02, 0.025):
-        then, now = (Corrections(book(*made), one, True).find(FocusTarget(curvature)) for one in (PLANNER, learnt))
+        then, now = (Corrections(book(*made), one, 1).find(FocusTarget(curvature)) for one in (PLANNER, learnt))
         np.testing.assert_allclose(now.effective, then.effective + moved, atol=1e-12)
         assert then.error * (1.0 - 1e-9) <= now.error < then.error + 1e-9
     lost = Corrections(book(*made), learnt).find(FocusTarget(0.02))
     np.testing.assert_array_equal(lost.effective, made[4].effective, "without maps since, as it was measured")
+
+
+def test_recipes_built_later_leave_the_others_what_was_learnt_before() -> None:
+    """A map agreed at 2: recipes built at 1 have moved with the calibration since, one built at 3 is as measured."""
+    made = [replace(recipe(c), by_model=own(FocusTarget(c)), stamp_ns=3 if c == 0.0 else 1) for c in CURVATURES]
+    updated: Any = StandIn(1e-9)
+    updated.mirror.command = lambda target: (own(target) + 0.01, 0.0)
+    corrections = Corrections(book(*made), updated, 2)
+    for built in made:
+        moved = 0.0 if built.stamp_ns == 3 else 0.01
+        np.testing.assert_allclose(corrections.find(FocusTarget(built.curvature)).effective, built.effective + moved)
 
 
 def test_the_worse_neighbour_counts() -> None:

@@ -170,7 +170,7 @@ class FocusRig(DriverRig):
         mirror = CalibratedMirror(self._model, mirror_from(self._infos[-1]).limits)
         plans = {c: mirror.plan(FocusTarget(c)).signals for c in np.linspace(-1.2 * REACH, 1.2 * REACH, 5).tolist()}
         recipes = tuple(Recipe(c, 0.0, signals, signals, 1e-9, 1e-9, 3) for c, signals in plans.items())
-        book = RecipeBook(recipes, DEGAUSS_STEPS, 1e-9, 0)
+        book = RecipeBook(recipes, DEGAUSS_STEPS, 1e-9)
         self._publisher_of_recipes.publish(recipe_book_message(book, message.id))
         self.publish_calibration(message)
         self.wait(

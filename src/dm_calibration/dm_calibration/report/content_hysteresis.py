@@ -144,8 +144,9 @@ def recipes(calibration: Calibration) -> Section:
     ranges = (f"{recipe.signals.min():+.3f} … {recipe.signals.max():+.3f}" for recipe in book.recipes)
     rows = [(*recipe_row(recipe), reach) for recipe, reach in zip(book.recipes, ranges, strict=True)]
     header = ("curvature, 1/m", "conic", "added terms", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
+    last = max(recipe.stamp_ns for recipe in book.recipes)
     text = (
-        f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "
+        f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(last)}. "
         "Halfway between neighbours the bound is larger than what was re-measured by "
         f"{length(book.interpolation_error, calibration.wavelength)} at most."
     )

@@ -12,8 +12,10 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
-#: Columns that every recipe has; its additional Zernike terms are kept as a table.
-_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model"))
+#: Columns that recipes have in files of every version, one row each.
+_RECIPE_COLUMNS = tuple(
+    field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model", "stamp_ns")
+)
 #: Scalar fields of the recipe book.
 _BOOK = tuple(field.name for field in fields(RecipeBook) if field.name != "recipes")
 
@@ -66,6 +68,7 @@ def recipe_columns(book: RecipeBook) -> dict[str, Column]:
     columns["recipes/zernike"] = np.array([recipe.zernike or len(TERMS) * (0.0,) for recipe in book.recipes])
     known = [recipe.by_model if recipe.by_model.size else np.nan * recipe.effective for recipe in book.recipes]
     columns["recipes/by_model"] = np.array(known)
+    columns["recipes/stamp_ns"] = np.array([recipe.stamp_ns for recipe in book.recipes])
     return columns | {f"recipes/{name}": np.array(getattr(book, name)) for name in _BOOK}
 
 
@@ -80,13 +83,16 @@ def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
     rows = [np.asarray(columns[f"recipes/{name}"]) for name in _RECIPE_COLUMNS]
     zernike = np.asarray(columns.get("recipes/zernike", np.zeros((len(rows[0]), 0)))).tolist()
     by_model = np.asarray(columns.get("recipes/by_model", np.full((len(rows[0]), 1), np.nan)))
+    # Older files have one time for all.
+    stamps = np.broadcast_to(np.asarray(columns["recipes/stamp_ns"]), len(rows[0])).tolist()
     recipes = tuple(
         replace(
             Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row)),
             zernike=tuple(terms),
             by_model=own if np.isfinite(own).all() else np.zeros(0),
+            stamp_ns=stamp,
         )
-        for row, terms, own in zip(zip(*rows, strict=True), zernike, by_model, strict=True)
+        for row, terms, own, stamp in zip(zip(*rows, strict=True), zernike, by_model, stamps, strict=True)
     )
     return RecipeBook(recipes, *(np.asarray(columns[f"recipes/{name}"]).item() for name in _BOOK))
 

@@ -268,9 +268,11 @@ def recipe_book(
     Raises:
         RecipeError: the recipes `before` begin with another degauss.
     """
-    known = [replace(recipe, by_model=loop.mirror.command(target_of(recipe))[0]) for recipe in recipes]
+    known = [
+        replace(recipe, by_model=loop.mirror.command(target_of(recipe))[0], stamp_ns=stamp_ns) for recipe in recipes
+    ]
     ordered = sorted(known, key=lambda recipe: recipe.shape)
-    book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
+    book = RecipeBook(tuple(ordered), degauss_steps, 0.0)
     whole = before.merged(book)
     between = Corrections(whole, loop).worst - max(recipe.max_zernike for recipe in whole.recipes)
     return replace(book, interpolation_error=between)

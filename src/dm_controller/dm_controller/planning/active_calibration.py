@@ -67,7 +67,7 @@ class ActiveCalibration:
     @cached_property
     def corrections(self) -> Corrections:
         """The corrections that the recipes give for other shapes. Raises RecipeError when there are none."""
-        return Corrections(self.recipes, self.planner, stamp_ns(self.calibration.checked) > self.recipes.stamp_ns)
+        return Corrections(self.recipes, self.planner, stamp_ns(self.calibration.checked))
 
     @property
     def conditioned_error(self) -> float:

@@ -85,8 +85,8 @@ class Corrections:
     """The corrections that the recipes of `book` show on the mirror of `planner`.
 
     Args:
-        learnt: whether maps have agreed with the calibration since the recipes were built: its updates since then shift
-            the recipes too. Otherwise recipes stay as measured, even if earlier updates are lost.
+        checked_ns: when a map last agreed with the calibration; its updates since a recipe was built shift that recipe
+            too. Recipes built later stay as measured, even if earlier updates are lost.
 
     Raises:
         RecipeError: there are none.
@@ -96,7 +96,7 @@ class Corrections:
         amplitude: m, bound of the largest coefficient of a correction where no recipe is near.
     """
 
-    def __init__(self, book: RecipeBook, planner: Planner, learnt: bool = False) -> None:
+    def __init__(self, book: RecipeBook, planner: Planner, checked_ns: int = 0) -> None:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
@@ -106,8 +106,9 @@ class Corrections:
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
         now = [planner.mirror.command(shape)[0] for shape in shapes]
-        known = zip(recipes, now, strict=True)
-        then = np.array([recipe.by_model if learnt and recipe.by_model.size else own for recipe, own in known])
+        updated = [recipe.by_model.size and checked_ns > recipe.stamp_ns for recipe in recipes]
+        known = zip(recipes, updated, now, strict=True)
+        then = np.array([recipe.by_model if moved else own for recipe, moved, own in known])
         tilt = self._other_tilt(then)
         self._then, self._own = then + tilt, np.array(now) + tilt
         self._corrections = self._effective - self._then

@@ -93,7 +93,7 @@ class FocusCard:
         """What a prediction depends on beside the fields: bounds, recipes, signals, known history, operation."""
         able, state, book = snapshot.capabilities, snapshot.actuator_state, snapshot.recipes
         promised = (able.calibration_id, able.error_bound, able.error_bound_conditioned) if able is not None else ()
-        recipes = (len(book.recipes), str(book.stamp)) if book is not None else ()
+        recipes = [str(recipe.stamp) for recipe in book.recipes] if book is not None else ()
         signals = () if state is None else (state.history_known, *(round(each, 1) for each in state.requested))
         return *promised, *recipes, *signals, self._session.running  # corrections of creep are below the rounding
 
