@@ -74,10 +74,10 @@ class CreepHold:
     def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
         """End the hold if the signals (N,) that the driver follows, reported at `now` (s, steady), are another's."""
         order = self._monitor.order
-        command = order.command if order is not None else None
-        if command is None or same_signals(requested, command.signals):
+        if order is None or order.command is None or same_signals(requested, order.command.signals):
             return
-        if command.confirmed or now - command.sent.steady > CONFIRM_S:
+        late = now - order.command.sent.steady > CONFIRM_S
+        if order.command.confirmed or (late and not order.fall_back(requested)):  # else a correction was lost
             self.end("another command came")
 
     def command(self, estimate: ActuatorEstimate, now: Moment) -> list[SendCommand]:

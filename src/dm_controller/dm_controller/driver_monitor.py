@@ -229,8 +229,7 @@ class DriverMonitor:
 
         Only the latest command counts, as at the driver.
         """
-        command = self.order.command if self.order is not None else None
-        if command is None or command.confirmed or command.given_up:
+        if self.order is None or (command := self.order.command) is None or command.confirmed or command.given_up:
             return None
         limit = self._values["driver_timeout"] or CONFIRM_S
         if not (command.lost or self.loss or now - command.sent.steady > limit):
@@ -249,6 +248,7 @@ class DriverMonitor:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
         if stamp_ns(report.header.stamp) < command.sent.ns:
             return Refusal(ErrorCode.TIMEOUT, f"{text}: it holds the earlier shape, no command has reached it since")
-        if command.expected_turns:  # a creep correction, which another client's command may overtake
+        if command.expected_turns:  # a creep correction, which was lost, or which another client's command overtook
+            self.order.fall_back(report.requested)
             return None
         return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another command")

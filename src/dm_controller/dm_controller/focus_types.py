@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
 from dm_common.errors import Refusal
+from dm_common.limits import same_signals
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
 
@@ -103,6 +105,13 @@ class Order:
         self.earlier = self.command if self.command is not None and self.command.confirmed else self.earlier
         self.command = SendCommand(signals, now, expected_turns, self.request.holder)
         return self.command
+
+    def fall_back(self, requested: Sequence[float] | Floats) -> bool:
+        """Take the command before the last one as the present one, if the driver still follows it; return whether."""
+        if self.earlier is None or not same_signals(requested, self.earlier.signals):
+            return False
+        self.command = self.earlier
+        return True
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
         """A command to stay at the present signals (N,), which after quantisation may break a limit by a step."""

@@ -925,6 +925,24 @@ def test_a_held_shape_is_corrected_for_creep(bench: Bench) -> None:
     assert bench.controller.monitor.progress(order, bench.time).reached
 
 
+@pytest.mark.parametrize("timeout", [3.0, 0.5])
+def test_a_correction_that_is_lost_is_sent_again(timeout: float) -> None:
+    bench = Bench(driver_timeout=timeout)
+    bench.degauss()
+    order = bench.ask(0.02)
+    bench.wait(2.0)
+    bench.obeys, sent = False, len(bench.commands)
+    for _ in range(60):
+        bench.wait(0.1)
+        bench.report()
+        assert bench.controller.monitor.progress(order, bench.time).failed is None
+    assert len(bench.commands) > sent
+    bench.obeys = True
+    bench.wait(3.0)
+    assert bench.controller.hold.active and bench.controller.monitor.progress(order, bench.time).reached
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
 def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) -> None:
     bench.history_known = False
     bench.report()
