@@ -69,8 +69,11 @@ class AppliedHistory(HysteresisObserver):
         times = [seen.report.time for seen in observed]
         at = next((k for k in reversed(range(len(observed))) if times[k] <= time), None)
         if at is None:
+            ahead = self.latest.time - self.latest.heard if self.latest is not None else 0.0
+            differ = f"; the last is stamped {ahead:.0f} s after its arrival: clocks differ"
             raise MapNotUsableError(
                 "the signals when the map was taken are not known: no actuator_state from that time"
+                + (differ if CLOCKS_DIFFER_S < ahead < np.inf else "")
             )
         report, estimate = observed[at]
         if not report.active:

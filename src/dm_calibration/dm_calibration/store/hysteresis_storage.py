@@ -13,9 +13,7 @@ from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
 #: Columns that recipes have in files of every version, one row each.
-_RECIPE_COLUMNS = tuple(
-    field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model", "stamp_ns")
-)
+_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name not in ("zernike", "by_model", "stamp_ns"))
 #: Scalar fields of the recipe book.
 _BOOK = tuple(field.name for field in fields(RecipeBook) if field.name != "recipes")
 
