@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -171,6 +174,29 @@ class TestContract:
             while time.monotonic() < end:
                 electronics.check()
                 time.sleep(0.05)
+
+    @pytest.mark.slow
+    def test_a_process_that_stands_still_in_a_write_loses_no_link(
+        self, unit: DriveUnit, electronics: DriveElectronics, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It was stopped, or others kept it from running, for longer than the time-out: the unit has its frame."""
+
+        def then_still(write: Any) -> Any:
+            def written(*arguments: Any) -> Any:
+                length = write(*arguments)
+                if threading.current_thread() is threading.main_thread():
+                    time.sleep(1.2)
+                return length
+
+            return written
+
+        codes, wired = random_frame(electronics, 3)
+        electronics.open()
+        monkeypatch.setattr(os, "write", then_still(os.write))
+        monkeypatch.setattr(socket.socket, "send", then_still(socket.socket.send), raising=False)
+        electronics.write(codes, wired)
+        electronics.check()
+        wait_until(lambda: unit.frames)
 
     def test_a_missing_setting_is_named(self, unit: DriveUnit) -> None:
         with pytest.raises(ValueError, match=r"electronics\.(address|serial_port) is empty"):

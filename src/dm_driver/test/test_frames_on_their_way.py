@@ -64,6 +64,20 @@ def test_a_large_change_waits_for_the_acknowledgement_and_is_not_sent_without(de
     connection.close()
 
 
+def test_a_process_that_stands_still_while_it_waits_asks_once_more() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        with Edac40Tcp(ElectronicsSettings("127.0.0.1", listener.getsockname()[1], timeout_s=0.1, doubt=DOUBT)) as unit:
+            unit.write(codes(0), WIRED)
+            answers = iter((86, 0))  # bytes on their way
+
+            def asked() -> int:
+                time.sleep(0.2)
+                return next(answers)
+
+            unit._on_the_way = asked  # type: ignore[method-assign]
+            unit.write(codes(60_000), WIRED)
+
+
 def test_a_large_change_goes_at_once_when_everything_has_arrived() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         with Edac40Tcp(ElectronicsSettings("127.0.0.1", listener.getsockname()[1], timeout_s=5.0, doubt=DOUBT)) as unit:

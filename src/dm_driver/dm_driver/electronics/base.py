@@ -1,7 +1,9 @@
 """What every drive unit offers: a number of output channels that take integer codes, and a link that can break."""
 
 import math
+import os
 import re
+import select
 import termios
 import time
 from abc import ABC, abstractmethod
@@ -205,6 +207,18 @@ class DriveElectronics(ABC):
         except (OSError, LinkError) as error:
             self._abandon()
             raise LinkError(f"{what} {self.where}: {error}") from error
+
+    def _send(self, data: bytes) -> None:
+        """Write to `_link`, which has a descriptor. Only waits for the unit count, not the time for which this process
+        was stopped, as with pySerial.
+
+        Raises:
+            LinkError: the unit took nothing within the timeout.
+        """
+        while data:
+            if not select.select([], [self._link], [], self._timeout_s)[1]:
+                raise LinkError(f"took no data within {self._timeout_s:g} s")
+            data = data[os.write(self._link.fileno(), data) :]
 
     def _abandon(self) -> None:
         self._open = False

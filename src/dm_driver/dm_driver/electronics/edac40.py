@@ -96,7 +96,7 @@ class Edac40Tcp(_Edac40):
     def _do_open(self) -> None:
         self._arrived = self._last = None
         url = f"socket://{self._settings.address}:{self._settings.port}"
-        self._link = protocol_socket.Serial(url, timeout=0, write_timeout=self._timeout_s)
+        self._link = protocol_socket.Serial(url, timeout=0)
         # A duplicate of the descriptor shares its options, which pySerial does not offer.
         with socket.socket(fileno=os.dup(self._link.fileno())) as options:
             # Nagle's algorithm would hold back a frame until the one before is acknowledged (up to 40 ms), then send
@@ -113,7 +113,7 @@ class Edac40Tcp(_Edac40):
         self._do_check()  # the first frame after the unit closed would be swallowed without an error
         if self._settings.doubt:
             self._await_arrival(codes)
-        self._link.write(encode_frame(codes, wired))
+        self._send(encode_frame(codes, wired))
         self._last = codes.copy()
 
     def _await_arrival(self, codes: NDArray[np.uint16]) -> None:
@@ -125,12 +125,13 @@ class Edac40Tcp(_Edac40):
         if self._last is None:
             return
         deadline = time.monotonic() + self._timeout_s
-        while self._on_the_way():
+        # The time is taken first: after this process was stopped, the unit is asked once more.
+        while (now := time.monotonic()) and self._on_the_way():
             if self._arrived is not None:
                 away = np.abs(codes.astype(np.int64) - self._arrived).max()
                 if 2 * away <= self._settings.doubt:
                     return
-            if time.monotonic() > deadline:
+            if now > deadline:
                 raise LinkError(f"no acknowledgement within {self._timeout_s:g} s")
             time.sleep(_ACKNOWLEDGEMENT_PERIOD_S)
             self._do_check()

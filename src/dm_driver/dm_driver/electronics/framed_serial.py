@@ -49,12 +49,9 @@ class FramedSerial(DriveElectronics):
             parity=_PARITY[self._frame.parity],
             stopbits=self._frame.stop_bits,
             timeout=self._timeout_s,
-            write_timeout=self._timeout_s,
             exclusive=True,
         )
-        opening = bytes.fromhex(self._frame.opening)
-        if opening:
-            self._link.write(opening)
+        self._send(bytes.fromhex(self._frame.opening))
 
     def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         pause = self._sent_at + 1.0 / self.frames_per_second - time.monotonic()
@@ -62,7 +59,7 @@ class FramedSerial(DriveElectronics):
             time.sleep(pause)
         if self._reply:
             self._do_check()  # a late answer is not the answer to this frame
-        self._link.write(self._frame.encode(codes))
+        self._send(self._frame.encode(codes))
         self._sent_at = time.monotonic()
         if self._reply:
             answer = self._link.read(len(self._reply))

@@ -60,11 +60,11 @@ class UsbDac40(DriveElectronics):
 
     def _do_open(self) -> None:
         # Exclusive: two writers on one unit would tear each other's frames.
-        self._link = serial.Serial(self._settings.serial_port, timeout=0, write_timeout=self._timeout_s, exclusive=True)
-        self._link.write(bytes(FRAME_LENGTH))  # ends any frame that an earlier program left half sent
+        self._link = serial.Serial(self._settings.serial_port, timeout=0, exclusive=True)
+        self._send(bytes(FRAME_LENGTH))  # ends any frame that an earlier program left half sent
 
     def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
-        self._link.write(encode_frame(codes))
+        self._send(encode_frame(codes))
 
     def _do_check(self) -> None:
         _ = self._link.in_waiting  # fails on a device that has been unplugged
