@@ -45,10 +45,10 @@ def write_whole(path: Path, content: bytes) -> None:
             stream.write(content)
         return
     path = Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # A name of its own: other threads, or a process of the same id in another container, may write the same file.
+    temporary = path.with_name(f".{path.name}.{os.urandom(4).hex()}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.unlink(missing_ok=True)  # left by a killed process that had the same id
         with temporary.open("xb") as file:
             with suppress(OSError):  # a new file; some file systems know no permissions
                 shutil.copymode(path, temporary)

@@ -2,6 +2,7 @@
 
 import os
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,16 @@ def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None
     assert sorted(tmp_path.rglob("*")) == [link, file.parent, file]
     write_whole(file, b"third")
     assert stat.S_IMODE(file.stat().st_mode) == 0o660
+
+
+def test_what_two_write_at_once_is_whole_at_any_moment(tmp_path: Path) -> None:
+    file, contents = tmp_path / "figures.json", (b"a" * 100_000, b"b" * 100_000)
+    write_whole(file, contents[0])
+    with ThreadPoolExecutor(2) as writers:
+        written = [writers.submit(write_whole, file, content) for content in 25 * contents]
+        while not all(each.done() for each in written):
+            assert file.read_bytes() in contents
+    assert not any(each.exception() for each in written) and list(tmp_path.iterdir()) == [file]
 
 
 def test_a_pipe_is_written_to_and_not_replaced_by_a_file(tmp_path: Path) -> None:
