@@ -11,8 +11,9 @@ from dm_common.errors import ErrorCode
 
 def _text(value: Any) -> str:
     text = os.fspath(value)
-    if not isinstance(text, str):
-        raise TypeError("bytes")
+    if not isinstance(text, str) or "\0" in text:  # a message would end at a NUL
+        raise TypeError("bytes, or a NUL")
+    text.encode()  # raises a ValueError for names of files that are not UTF-8
     return text
 
 
@@ -22,6 +23,8 @@ def _flag(value: Any) -> bool:
     return bool(value)
 
 
+#: What these types allow, for messages.
+_ALLOWED = {"boolean": "true or false", "string": "string of UTF-8, no NUL"}
 #: Conversion of a value to each of these types; raises TypeError, ValueError or OverflowError if it is not possible.
 _CONVERTED: dict[str, Callable[[Any], Any]] = {
     "boolean": _flag,
@@ -56,7 +59,7 @@ def _field(name: str, value: Any, type_name: str) -> Any:
             return [_one(name, each, element) for each in value]
         return _one(name, value, element)
     except (TypeError, ValueError, OverflowError) as error:
-        text = f"{name} = {value!r}: must be {type_name.replace('boolean', 'true or false')}"
+        text = f"{name} = {value!r}: must be {_ALLOWED.get(type_name, type_name)}"
         raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text) from error
 
 

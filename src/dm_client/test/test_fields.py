@@ -35,6 +35,8 @@ def test_what_means_the_same_is_taken() -> None:
         (Degauss.Goal, {"steps": 1.5}, ErrorCode.INVALID_ARGUMENT, r"steps = 1.5: must be uint32"),
         (Measure.Request, {"label": 3}, ErrorCode.INVALID_ARGUMENT, "label = 3: must be string"),
         (IngestFile.Request, {"path": b"/a"}, ErrorCode.INVALID_ARGUMENT, "path = b'/a': must be string"),
+        (IngestFile.Request, {"path": "/\udcfc"}, ErrorCode.INVALID_ARGUMENT, "path = .* must be string of UTF-8"),
+        (SetSignals.Request, {"holder": "a\0b"}, ErrorCode.INVALID_ARGUMENT, r"holder = 'a.x00b': must be .* no NUL"),
         (UpdateCalibration.Request, {"without": [-1]}, ErrorCode.OUT_OF_RANGE, "without = -1: must be 0 to"),
         (UpdateCalibration.Request, {"without": 5}, ErrorCode.INVALID_ARGUMENT, "without = 5: must be sequence"),
         (SetSignals.Request, {"signals": ["a"]}, ErrorCode.INVALID_ARGUMENT, "signals = .'a'.: must be sequence"),
