@@ -85,6 +85,15 @@ def test_a_damaged_frame_is_rejected_and_the_next_one_taken(place: int, words: s
     assert decoder.take(stream) is not None
 
 
+@pytest.mark.parametrize("opening", ["55", "A5", "A5 5A", "A5 5A 01"])
+def test_an_opening_may_begin_as_frames_do(opening: str) -> None:
+    decoder = FramedDecoder(FramedConfig(**SHEET | {"opening": opening}))
+    frame = FrameFormat(**SHEET).encode(np.arange(24, dtype=np.uint16))
+    stream = bytearray.fromhex(opening) + frame + frame
+    for _frame in range(2):
+        assert decoder.take(stream) is not None
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -102,7 +102,7 @@ class FramedDecoder:
         Raises:
             FrameError: bytes that are not a frame; they are removed as well.
         """
-        if self._opening and stream.startswith(self._opening):
+        if self._opening and stream.startswith(self._opening + self._header):
             del stream[: len(self._opening)]
         start = stream.find(self._header)
         if start != 0 and len(stream) >= self._length:
