@@ -88,18 +88,11 @@ class SafetyLimiter:
         Raises:
             Refusal: STALE.
         """
-        if not age_s <= self.limits.command_age:
-            raise Refusal(
-                ErrorCode.STALE,
-                f"header.stamp is {age_s:.3f} s old: must be at most {self.limits.command_age:g} s"
-                " (limits.command_age)",
-            )
-        if age_s < -self.limits.command_lead:
-            raise Refusal(
-                ErrorCode.STALE,
-                f"header.stamp lies {-age_s:.3f} s in the future: must be at most {self.limits.command_lead:g} s"
-                " (limits.command_lead); do the clocks agree?",
-            )
+        name, place = ("lead", "in the future") if age_s < 0.0 else ("age", "old")
+        most = getattr(self.limits, f"command_{name}")
+        if not abs(age_s) <= most:
+            rule = f"must be at most {most:g} s (limits.command_{name}); do the clocks agree?"
+            raise Refusal(ErrorCode.STALE, f"header.stamp is {abs(age_s):.3f} s {place}: {rule}")
 
     def check_write(self, previous: Shape | None, shape: Shape) -> None:
         """The last check before a write: a legal shape, and no step larger than allowed.

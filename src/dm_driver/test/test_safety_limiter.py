@@ -92,8 +92,8 @@ def test_age_of_commands() -> None:
     for fresh in (0.0, 0.499, -0.199):
         limiter.check_age(fresh)
     for stale, text in (
-        (0.51, "0.510 s old: must be at most 0.5 s"),
-        (-0.21, "0.210 s in the future"),
+        (0.51, r"0.510 s old: must be at most 0.5 s \(limits.command_age\); do the clocks agree"),
+        (-0.21, r"0.210 s in the future: must be at most 0.2 s \(limits.command_lead\); do the clocks agree"),
         (math.nan, "nan s old"),
     ):
         with pytest.raises(Refusal, match=text) as caught:

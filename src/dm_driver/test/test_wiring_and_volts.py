@@ -41,7 +41,7 @@ def test_first_and_last_channels_of_the_tables() -> None:
     ("name", "custom", "actuators", "text"),
     [
         ("hexagon", [], 37, "'hexagon': unknown; must be one of trihex, 37ch_30mm, 37ch_30mm_v2005, custom"),
-        ("trihex", [], 19, "lists 37 channels: must be 19"),
+        ("trihex", [], 19, "mirror.wiring = 'trihex' lists 37 channels: must be 19"),
         ("trihex", [1, 2], 37, "mirror.channels is given but mirror.wiring = 'trihex'"),
         ("custom", [1, 2, 3], 4, "mirror.channels lists 3 channels: must be 4"),
         ("custom", [1, 2, 40], 3, "actuator 3 on channel 40; must be -1 to 39"),

@@ -49,7 +49,7 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
     if name == CUSTOM:
         source, table, lowest = "mirror.channels", tuple(custom), NOT_WIRED
     else:
-        source, table, lowest = f"wiring table {name!r}", TABLES[name], 0
+        source, table, lowest = f"mirror.wiring = {name!r}", TABLES[name], 0
         if custom:
             raise ValueError(
                 f"mirror.channels is given but mirror.wiring = {name!r}: set mirror.wiring to {CUSTOM!r}, or leave"

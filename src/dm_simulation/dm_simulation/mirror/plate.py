@@ -64,7 +64,7 @@ def actuator_positions(
         ring += 1
     if placed != actuators:
         raise ValueError(
-            f"{name} = {actuators}: full rings hold 1, 7, 19, 37, 61, ...; of others give plate.actuator_x and _y"
+            f"{name} = {actuators}: full rings hold 1, 7, 19, 37, 61, ...; a plate takes others by plate.actuator_x, _y"
         )
     points = np.concatenate(grid)
     points = pitch * np.exp(1j * start_angle) * (points.conj() if clockwise else points)
