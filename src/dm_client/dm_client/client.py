@@ -126,6 +126,8 @@ class DeformableMirrorClient(Connection):
         """Wait until the driver, and the controller if there is one, take requests. Raises DeformableMirrorError."""
 
         def refusal() -> tuple[int, str]:
+            if (driver := self._servers["set_signals"]).lost:
+                return ErrorCode.DRIVER_UNAVAILABLE, driver.text
             state, able = self.messages.get("actuator_state"), self.messages.get("capabilities")
             if state is None or state.driver_state != ActuatorState.STATE_ACTIVE:
                 reason = (state.message or "it is not active") if state else "it is not heard: are the nodes running?"
@@ -284,10 +286,8 @@ class DeformableMirrorClient(Connection):
         **claim: Unpack[Claim],
     ) -> BuildRecipes.Result:
         """Build a recipe for each curvature [1/m] on the bench, with `zernike` [m] added; they are stored."""
-        shapes = {"curvatures": curvatures, "zernike": zernike}
-        goal = filled(
-            BuildRecipes.Goal, **shapes, conic_constant=conic_constant, tolerance=tolerance, max_maps=max_maps, **claim
-        )
+        shapes = {"curvatures": curvatures, "conic_constant": conic_constant, "zernike": zernike}
+        goal = filled(BuildRecipes.Goal, **shapes, tolerance=tolerance, max_maps=max_maps, **claim)
         return self.run_action("build_recipes", goal, on_feedback, timeout_s)
 
     def calibrate(

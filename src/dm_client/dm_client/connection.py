@@ -176,10 +176,10 @@ class Connection:
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
         """Wait until `condition()` is true; False on time-out.
 
-        Raises DeformableMirrorError once the client is closed.
+        Raises DeformableMirrorError once the client is closed, even if `condition()` is true.
         """
         deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
-        while not condition():
+        while self._over() or not condition():
             self._check_open()
             if time.monotonic() > deadline:
                 return False

@@ -23,7 +23,11 @@ from dm_common.ros.qos import Liveliness
 
 #: A node that is there.
 THERE: Any = SimpleNamespace(
-    heard=lambda: None, wait_for_return=lambda: None, since_now=lambda: lambda: "", missing=lambda _served: False
+    lost=False,
+    heard=lambda: None,
+    wait_for_return=lambda: None,
+    since_now=lambda: lambda: "",
+    missing=lambda _served: False,
 )
 
 
@@ -34,6 +38,7 @@ def client(driver: int, able: int | None) -> DeformableMirrorClient:
     heard._context = SimpleNamespace(ok=lambda: True)
     heard._subscribed = {"actuator_state", "capabilities"}
     heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
+    heard._servers, heard._timeout_s = {"set_signals": THERE}, 10.0
     if able is not None:
         heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
     return heard
@@ -59,6 +64,22 @@ def test_it_is_not_ready_while_either_says_otherwise(driver: int, able: int, cod
     with pytest.raises(DeformableMirrorError) as waited:
         client(driver, able).wait_until_active(0.0)
     assert waited.value.error_code == code
+
+
+def test_it_is_not_ready_while_the_driver_is_lost_whatever_that_said_before() -> None:
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.NOT_CALIBRATED)
+    mirror._servers = {"set_signals": SimpleNamespace(lost=True, text="pdm_driver has died")}  # type: ignore[dict-item]
+    with pytest.raises(DeformableMirrorError, match="pdm_driver has died") as waited:
+        mirror.wait_until_active(0.0)
+    assert waited.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
+
+
+def test_what_was_heard_last_is_not_told_once_nothing_more_can_come() -> None:
+    mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    assert mirror.actuator_state.driver_state == ActuatorState.STATE_ACTIVE
+    mirror._context = SimpleNamespace(ok=lambda: False)  # type: ignore[assignment]
+    with pytest.raises(DeformableMirrorError, match="rclpy was shut down"):
+        _ = mirror.actuator_state
 
 
 def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
