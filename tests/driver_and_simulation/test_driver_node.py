@@ -377,11 +377,15 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     start("dm_driver", "pdm_driver", parameters(unit, autostart=False))
     driver = Driver(observer, unit)
     driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
-    assert driver.set_signals(np.zeros(37)).error_code == ErrorCode.DRIVER_INACTIVE
+    answer = driver.set_signals(np.zeros(37))
+    assert answer.error_code == ErrorCode.DRIVER_INACTIVE
+    assert answer.message.endswith("`ros2 lifecycle set /pdm_driver configure`, then `activate`")
     assert driver.change(Transition.TRANSITION_CONFIGURE)
     driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_INACTIVE, "inactive")
     answer = driver.set_signals(np.zeros(37))
     assert answer.error_code == ErrorCode.DRIVER_INACTIVE and "activate" in answer.message
+    assert answer.message == "pdm_driver is not active: `ros2 lifecycle set /pdm_driver activate`"
+    driver.wait_for_state(lambda state: state.message == answer.message, "the reason")
     driver.command(np.zeros(37))
     driver.wait_for_state(lambda state: state.error_code == ErrorCode.DRIVER_INACTIVE, "refusal")
     assert unit.raw == b""
@@ -398,7 +402,8 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
     assert driver.change(Transition.TRANSITION_CLEANUP)
-    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
+    state = driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
+    assert "configure`, then `activate`" in state.message
     assert driver.set_parameter("mirror.serial", "another") == ""
     assert driver.change(Transition.TRANSITION_CONFIGURE)
     wait_until(lambda: driver.infos[-1].serial == "another", what="the new serial number")

@@ -128,7 +128,7 @@ class InterferometerNode(ManagedNode):
 
     def _on_ingest_file(self, request: IngestFile.Request, response: IngestFile.Response) -> IngestFile.Response:
         if not self.configured:
-            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
+            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, self.inactive())
         with self._counting_refusals():
             if not request.path:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, "path is empty: must name a map file")
@@ -142,8 +142,8 @@ class InterferometerNode(ManagedNode):
 
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         acquisition = self._acquisition
-        if not self.active or acquisition is None:
-            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first")
+        if (reason := self.inactive()) or acquisition is None:
+            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, reason)
         timeout_s = request.timeout or self._values["measure_timeout"]
         with self._counting_refusals():
             surface, measured = acquisition.acquire(timeout_s)

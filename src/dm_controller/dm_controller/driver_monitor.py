@@ -38,7 +38,8 @@ def _not_active(report: ActuatorState) -> Refusal:
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
         text = f"pdm_driver has lost the link to the electronics{reason}"
         return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, text)
-    return Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
+    says_so = report.message and report.driver_state != ActuatorState.STATE_SAFING  # and what to do
+    return Refusal(ErrorCode.DRIVER_INACTIVE, report.message if says_so else f"pdm_driver is not active{reason}")
 
 
 class DriverMonitor:

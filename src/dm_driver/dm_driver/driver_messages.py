@@ -52,7 +52,8 @@ def state_message(
     message.history_known = state.history_known
     message.degausses, message.turns = state.degausses, state.turns
     if not state.link_up:
-        waits = "" if state.enabled else "the driver is not active, and the drive electronics are unreachable: "
+        inactive = refusal or "the driver is not active"
+        waits = "" if state.enabled else f"{inactive}, and the drive electronics are unreachable: "
         message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, f"{waits}{state.fault}"
     connected = configuration.output.connected
     flags = np.where(connected, 0, ActuatorState.FLAG_UNUSED).astype(np.uint8)

@@ -13,6 +13,7 @@ from typing import Any
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
@@ -45,7 +46,7 @@ class PdmDriverNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("pdm_driver", PARAMETERS)
         self._hold = MirrorHold(time.monotonic)
-        self._gate = CommandGate(self._hold, self._on_gate)
+        self._gate = CommandGate(self._hold, self._on_gate, self.inactive)
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         # Guards publishing, which happens in the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
@@ -64,10 +65,10 @@ class PdmDriverNode(ManagedNode):
 
     # Lifecycle
 
-    def refused(self, reason: str) -> None:
-        self._gate.trouble = f"configuration refused: {reason}"
-        self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, self._gate.trouble)
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        done = super().on_configure(state)
         self._publish_state()
+        return done
 
     def configure(self) -> None:
         configuration = build_configuration(self._values)
@@ -82,7 +83,7 @@ class PdmDriverNode(ManagedNode):
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
         self._timer.reset()  # else the period that has begun would continue, up to a minute
         self._gate.configuration = configuration
-        self._gate.refusal, self._gate.trouble = None, ""
+        self._gate.refusal = None
         self._gate.writer = ActuatorWriter(
             configuration.electronics,
             configuration.output,
@@ -99,7 +100,6 @@ class PdmDriverNode(ManagedNode):
         self._info_publisher.publish(
             mirror_info_message(self._values, configuration, self._frame_id, self.get_clock().now().to_msg())
         )
-        self._publish_state()
 
     def _last_shape(self, configuration: DriverConfiguration) -> LastShape:
         """The record of what was last sent to this unit; an empty one if none can be kept."""
@@ -130,7 +130,6 @@ class PdmDriverNode(ManagedNode):
         self._publish_state()
 
     def clean_up(self) -> None:
-        self._gate.trouble = ""
         self._close("cleanup")
 
     def make_safe(self) -> None:
@@ -245,16 +244,19 @@ class PdmDriverNode(ManagedNode):
         with self._state_lock:
             if not self.context.ok():  # when the process ends, nobody is left to publish to
                 return
-            gate, writer, configuration = self._gate, self._gate.writer, self._gate.configuration
+            refusal, writer, configuration = self._gate.refusal, self._gate.writer, self._gate.configuration
+            if reason := self.inactive():
+                refusal = Refusal(ErrorCode.INVALID_ARGUMENT if self.trouble else ErrorCode.DRIVER_INACTIVE, reason)
             if writer is None or configuration is None:
-                message = unconfigured_message(self._frame_id, gate.refusal, self._hold)
+                message = unconfigured_message(self._frame_id, refusal, self._hold)
             else:
-                message = state_message(writer.state(), gate.refusal, configuration, self._frame_id, self._hold)
+                message = state_message(writer.state(), refusal, configuration, self._frame_id, self._hold)
             self._state_publisher.publish(message)
             self._published_at = time.monotonic()
 
     def health(self) -> Health:
-        return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused, self._gate.trouble)
+        trouble = self.inactive() if self.trouble else ""
+        return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused, trouble)
 
 
 def main() -> int:

@@ -110,7 +110,7 @@ class BenchServices:
         """Raise Refusal when the driver says that it takes no commands."""
         state = self.state
         if state is not None and state.driver_state not in (state.STATE_ACTIVE, state.STATE_LINK_LOST):
-            raise Refusal(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
+            raise Refusal(ErrorCode.DRIVER_INACTIVE, state.message or "pdm_driver is not active: activate it first")
 
     def check_history(self) -> None:
         """Raise Refusal when the driver knew the history of the actuators and no longer does.

@@ -67,6 +67,7 @@ class ManagedNode(LifecycleNode):
 
     Attributes:
         configured, active: its state.
+        trouble: why the last transition failed; "" = it did not.
         session: if it `requires_activation`, changes with every (de)activation, which makes earlier goals invalid.
     """
 
@@ -86,7 +87,7 @@ class ManagedNode(LifecycleNode):
         super().__init__(name, **keywords)
         self.configured = self.active = False
         self.session = 0
-        self._trouble = ""
+        self.trouble = ""
         self._made: Mapping[str, Any] | None = None  # parameters of the last `configure`
         self._unlock = "deactivate" if self.requires_activation else "cleanup"
         self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
@@ -124,7 +125,7 @@ class ManagedNode(LifecycleNode):
             return ""
         if self._state_machine.current_state[1] in ("shuttingdown", "finalized"):
             return f"{self.get_name()} was shut down: start its process again"
-        name, trouble = self.get_fully_qualified_name(), f" ({self._trouble})" if self._trouble else ""
+        name, trouble = self.get_fully_qualified_name(), f" ({self.trouble})" if self.trouble else ""
         steps = "activate" if self.configured else "configure`, then `activate"
         return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"
 
@@ -135,7 +136,7 @@ class ManagedNode(LifecycleNode):
 
     def _health_in_any_state(self) -> Health:
         if self.requires_activation and (reason := self.inactive()):
-            return Health(ERROR if self._trouble else WARN, reason)
+            return Health(ERROR if self.trouble else WARN, reason)
         return self.health()
 
     def _unlocked(self) -> bool:
@@ -152,8 +153,9 @@ class ManagedNode(LifecycleNode):
         def answer(request: Any, response: Any) -> Any:
             try:
                 return change(request, response)
-            except RuntimeError as error:
-                self.get_logger().warning(f"transition {request.transition.label or request.transition.id}: {error}")
+            except RuntimeError:
+                wanted, state = request.transition.label or request.transition.id, self._state_machine.current_state[1]
+                self.get_logger().warning(f"transition {wanted}: not possible in the state {state}")
                 response.success = False
                 return response
 
@@ -161,19 +163,19 @@ class ManagedNode(LifecycleNode):
 
     def _done(self, *steps: Callable[[], None]) -> TransitionCallbackReturn:
         """Take the steps of a transition and log their exceptions, which rclpy does not do."""
+        self.trouble = ""
         try:
             for step in steps:
                 step()
         except ValueError as error:
-            self.active, self._trouble = False, str(error)
+            self.active, self.trouble = False, str(error)
             self.get_logger().error(f"configuration refused: {error}")
-            self.refused(self._trouble)
+            self.refused(self.trouble)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            self._trouble = f"a defect, see the log: {error}"
+            self.trouble = f"a defect, see the log: {error}"
             self.get_logger().error(traceback.format_exc())
             return TransitionCallbackReturn.ERROR
-        self._trouble = ""
         return TransitionCallbackReturn.SUCCESS
 
     def _make(self) -> None:
@@ -220,7 +222,7 @@ class ManagedNode(LifecycleNode):
     on_shutdown = on_cleanup
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        trouble = self._trouble
+        trouble = self.trouble
         done = self._done(self._release)
-        self._trouble = trouble  # it is unconfigured now, for this reason
+        self.trouble = trouble  # it is unconfigured now, for this reason
         return done

@@ -28,20 +28,21 @@ class CommandGate:
 
     Args:
         report: called with a line for the log after each refusal, and, with True, when the mirror was taken over.
+        inactive: returns the reason why the driver takes no commands, as a sentence; "" = it is active.
 
     Attributes:
         writer, configuration: of the configured driver; None = it is not configured.
-        refusal: of the last command, or of the configuration; None = it was carried out.
-        trouble: why the configuration was refused; "" = it was not.
+        refusal: of the last command; None = it was carried out.
         refused: number of refused commands by the name of their code.
     """
 
-    def __init__(self, hold: MirrorHold, report: Callable[[str, bool], None]) -> None:
-        self.hold, self._report = hold, report
+    def __init__(
+        self, hold: MirrorHold, report: Callable[[str, bool], None], inactive: Callable[[], str] = lambda: ""
+    ) -> None:
+        self.hold, self._report, self._inactive = hold, report, inactive
         self.writer: ActuatorWriter | None = None
         self.configuration: DriverConfiguration | None = None
         self.refusal: Refusal | None = None
-        self.trouble = ""
         self.refused: Counter[str] = Counter()
 
     def attempt(
@@ -62,9 +63,9 @@ class CommandGate:
         if not dry_run:
             self.refusal = None  # before the writer's thread publishes the first write
         try:
-            if writer is None or configuration is None:
-                reason = self.trouble or "configure and activate it first"
-                raise Refusal(ErrorCode.DRIVER_INACTIVE, f"the driver is not configured: {reason}")
+            reason = self._inactive()
+            if writer is None or configuration is None or (reason and not dry_run):
+                raise Refusal(ErrorCode.DRIVER_INACTIVE, reason or "pdm_driver ends")
             TEXT.check("holder", request.holder)
             with self.hold.lock:  # else somebody might be granted the mirror in between, and lose it to this command
                 takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
