@@ -373,6 +373,16 @@ def test_a_signal_ramps_to_the_safe_shape(
     assert "the mirror stands in the safe shape" in node.output
 
 
+def test_a_degauss_is_answered_when_the_process_ends(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
+    node, driver = start("dm_driver", "pdm_driver", parameters(unit)), Driver(observer, unit)
+    driver.wait_active()
+    _, result = observer.send_goal(Degauss, "degauss", Degauss.Goal(steps=2000))
+    wait_until(lambda: driver.states[-1].moving)
+    assert node.stop() == 0
+    wait_until(result.done)
+    assert result.result().result.error_code == ErrorCode.DRIVER_INACTIVE and "Traceback" not in node.output
+
+
 def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
     start("dm_driver", "pdm_driver", parameters(unit, autostart=False))
     driver = Driver(observer, unit)

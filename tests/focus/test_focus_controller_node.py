@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -263,6 +264,21 @@ def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_i
     change(Transition.TRANSITION_CONFIGURE, possible=False)
     bench.follow = True
     wait_until(lambda: bench.set_focus(curvature=0.01).error_code == ErrorCode.OK)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_goal_is_answered_when_the_process_ends(
+    observer: Observer, start: Callable[..., NodeProcess], number: int
+) -> None:
+    bench, controller = Bench(observer, follow=False), start("dm_controller", "focus_controller", {})
+    bench.ready()
+    _, result = observer.send_goal(MoveFocus, "move_focus", MoveFocus.Goal(request=FocusRequest(curvature=0.01)))
+    wait_until(lambda: len(bench.commands) == 1)
+    assert controller.stop(number) == 0
+    wait_until(result.done)
+    assert result.result().result.error_code == ErrorCode.CANCELED
+    wait_until(lambda: bench.capabilities[-1].error_code == ErrorCode.NODE_INACTIVE)
+    assert "Traceback" not in controller.output
 
 
 def test_move_is_aborted_when_the_driver_loses_its_electronics(bench: Bench) -> None:

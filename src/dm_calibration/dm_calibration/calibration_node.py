@@ -116,6 +116,7 @@ class CalibrationNode(ManagedNode):
         mirror = self._manager.mirror
         if self._server.busy and self._bench_services.hold.end() and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench_services.rest_at_exit(mirror.rest)}")
+        super().make_safe()
         self._reports.end()
 
     def _calibrate(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:

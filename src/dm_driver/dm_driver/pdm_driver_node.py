@@ -134,7 +134,9 @@ class PdmDriverNode(ManagedNode):
 
     def make_safe(self) -> None:
         """Ramp to the safe shape and close the electronics; runs when the process ends (SIGINT, SIGTERM)."""
+        self.active = False
         self._close("end of the process")
+        super().make_safe()
 
     def _to_safe_shape(self, occasion: str) -> None:
         writer, configuration = self._gate.writer, self._gate.configuration
@@ -188,8 +190,8 @@ class PdmDriverNode(ManagedNode):
         return self._signals_set(response)
 
     def _signals_set(self, response: Any, outcome: Outcome | None = None) -> Any:
-        if outcome is not None and outcome is not Outcome.REACHED:
-            response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
+        if outcome is not None and (ended := self._gate.outcome(outcome)) is not Outcome.REACHED:
+            response.error_code, response.message = CODE_OF_OUTCOME[ended], ended.value
         writer = self._gate.writer
         if writer is not None and (applied := writer.state().applied) is not None:
             response.applied.frombytes(applied.tobytes())

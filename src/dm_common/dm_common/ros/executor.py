@@ -50,6 +50,8 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKE_PERIOD_S = 1.0
 #: An answer that took this long to send was dropped, s; others take less than a millisecond.
 DROPPED_S = 0.09
+#: When a node ends: longest wait for the ends of its goals, and time to send their results, s.
+GOALS_END_S, RESULTS_S = 1.0, 0.1
 #: Pauses before each further try to send a dropped answer, s. Each try blocks the process for a tenth of a second, and
 #: the client may never be discovered.
 PAUSES_S = (0.3, 1.0, 3.0)
@@ -170,6 +172,16 @@ def destroy(node: Node) -> None:
     node.destroy_node()
 
 
+def send_results(node: Node) -> None:
+    """Serve a node that ends until its goals, which were made to end, have done so and their clients know."""
+    servers = [each for each in node.waitables if isinstance(each, ResendingActionServer) and each.unfinished]
+    end = time.monotonic() + GOALS_END_S
+    while node.executor is not None and servers and time.monotonic() < end:
+        node.executor.spin_once(timeout_sec=0.02)
+        if not any(each.unfinished for each in servers):
+            end = min(end, time.monotonic() + RESULTS_S)
+
+
 def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
     """Run one node as a process: `main()` of every node calls this.
 
@@ -249,6 +261,11 @@ class ResendingActionServer(ActionServer):
             goal_handle.execute()
 
         super().__init__(*arguments, goal_callback=accept, handle_accepted_callback=execute, **keywords)
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether a goal has no outcome yet."""
+        return any(handle.is_active for handle in list(self._goal_handles.values()))
 
     async def _execute_goal_request(self, request: Any) -> None:
         self._accepted_at = self._executed_at = 0.0

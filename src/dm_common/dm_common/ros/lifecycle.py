@@ -11,6 +11,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.executor import send_results
 from dm_common.ros.parameters import Parameter, declare
 
 OK = DiagnosticStatus.OK
@@ -138,6 +139,12 @@ class ManagedNode(LifecycleNode):
         if self.requires_activation and (reason := self.inactive()):
             return Health(ERROR if self.trouble else WARN, reason)
         return self.health()
+
+    def make_safe(self) -> None:
+        """At the end of the process: goals end as when the node is deactivated, and their clients are told."""
+        if self.requires_activation:
+            self._rest()
+        send_results(self)
 
     def _unlocked(self) -> bool:
         return not (self.active if self.requires_activation else self.configured)

@@ -45,6 +45,10 @@ class CommandGate:
         self.refusal: Refusal | None = None
         self.refused: Counter[str] = Counter()
 
+    def outcome(self, outcome: Outcome) -> Outcome:
+        """The outcome of a move; if the way to the safe shape ended it, the driver stopped."""
+        return Outcome.STOPPED if outcome is Outcome.SUPERSEDED and self._inactive() else outcome
+
     def attempt(
         self,
         source: str,

@@ -84,6 +84,7 @@ class DegaussAction:
                         remaining=max(0.0, move.duration - (now - began)),
                     )
                 )
+        ended = self._gate.outcome(ended)
         if ended is not Outcome.REACHED:
             open_to_all = ended is Outcome.SUPERSEDED and not handle.request.holder
             cure = "; hold_mirror keeps other commands away: give its holder in this goal" if open_to_all else ""
