@@ -473,7 +473,7 @@ def test_a_map_from_which_the_instrument_took_something_else_is_refused(
 ) -> None:
     updates = begun((made[0], replace(made[1], system_error_subtracted=0)), tmp_path)
     measured = bench.measure("check")
-    with pytest.raises(MapNotUsableError, match="system_error_subtracted = 1, in the calibration's maps 0"):
+    with pytest.raises(MapNotUsableError, match="system_error_subtracted = 1, the calibration's is 0"):
         updates.take(replace(measured, system_error_subtracted=1), bench.settled())
     assert updates.take(measured, bench.settled()).accepted  # not known of it
 

@@ -33,8 +33,8 @@ HEIGHT_MAX = 1e-3
 #: Largest relative difference between the pitches along x and y for which pixels count as square.
 SQUARE_TOLERANCE = 0.01
 
-#: Relative tolerance for the pitch of two maps of one instrument; files keep the pitch in single precision.
-PITCH_TOLERANCE = 1e-4
+#: Relative tolerance for wavelength and pitch of maps of one instrument; files keep the pitch in single precision.
+SAME_LENGTH = 1e-4
 
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
 PITCH_MIN, PITCH_MAX = 1e-9, 1e-2  # m per pixel
@@ -124,7 +124,7 @@ class SurfaceMap:
         pitches = [each.pitch or pitch for each in (self, reference)]
         if here != there:
             return f"{size.format(*here)}, {name} has {size.format(*there)}"
-        if all(pitches) and abs(pitches[0] - pitches[1]) > PITCH_TOLERANCE * pitches[1]:
+        if all(pitches) and abs(pitches[0] - pitches[1]) > SAME_LENGTH * pitches[1]:
             return f"pitch {pitches[0] * 1e6:.3f} um, {name} has {pitches[1] * 1e6:.3f} um"
         if reference.wavelength and abs(self.wavelength - reference.wavelength) > wavelength_tolerance:
             return f"wavelength {self.wavelength * 1e9:.3f} nm, {name} has {reference.wavelength * 1e9:.3f} nm"

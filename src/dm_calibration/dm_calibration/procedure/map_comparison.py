@@ -1,16 +1,29 @@
-"""Check that a map may enter the same fit as the maps before it."""
+"""Check that a map may enter the same fit, or comparison, as the maps before it."""
+
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
 from dm_calibration.influence.maps import same_points
-from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
-from dm_calibration.procedure.outcome import Outcome, Setup
+from dm_calibration.map_files.surface_map import SAME_LENGTH
+from dm_calibration.procedure.outcome import Outcome
 from dm_common.errors import ErrorCode, MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
 
-#: Largest relative difference of wavelengths between maps.
-WAVELENGTH_TOLERANCE = 1e-4
+#: How messages name the properties that maps of one fit must share: a value, whose the other is, and the other.
+_PROPERTIES = {
+    "wavelength": "wavelength {:.3f} nm, {} {:.3f} nm (0 = not known)",
+    "instrument": "instrument {!r}, {} {!r}",
+    "camera": "camera of {0[0]} x {0[1]} pixels, {1} {2[0]} x {2[1]}",
+    "pitch": "pixel pitch {:.3f} um, {} {:.3f} um (0 = not known)",
+    "orientation": "orientation (flip_x, flip_y, rotate_deg) {}, {} {}",
+    "reference_surface": "reference_surface {!r}, {} {!r}",
+    "system_error_subtracted": "system_error_subtracted = {}, {} {} (1 = the instrument had subtracted its own error)",
+}
+#: Units of those that are lengths, m; such values may differ by rounding.
+_UNITS = {"wavelength": 1e-9, "pitch": 1e-6}
 
 
 def check_comparable(
@@ -44,16 +57,44 @@ def check_not_earlier(measured: Measurement, outcome: Outcome) -> None:
         )
 
 
+def other_aperture(measured: Measurement, radius: float, tolerance: float, whose: str) -> str:
+    """How the aperture of a map differs from the `radius` (m) of the mirror or calibration; "" = not, or not known.
+
+    Args:
+        tolerance: relative.
+        whose: the words before the value of the other radius.
+    """
+    if not measured.radius or abs(measured.radius - radius) <= tolerance * radius:
+        return ""
+    return f"aperture radius {measured.radius * 1e3:.3f} mm, {whose} {radius * 1e3:.3f} mm +-{tolerance:.1%}"
+
+
+def other_setup(measured: Measurement, other: Any, names: Iterable[str], whose: str) -> str:
+    """The first of the properties `names` in which a map differs from `other`, with both values; "" = none.
+
+    Args:
+        other: has these properties too: the setup of a run, or a calibration.
+        whose: the words before the value of `other`.
+    """
+    for name in names:
+        here, there = getattr(measured, name), getattr(other, name)
+        same = here == there
+        if unit := _UNITS.get(name):
+            same, here, there = np.isclose(here, there, rtol=SAME_LENGTH, atol=0.0), here / unit, there / unit
+        if not same:
+            return _PROPERTIES[name].format(here, whose, there)
+    return ""
+
+
 def _difference(measured: Measurement, outcome: Outcome, working_radius: float, tolerance: float) -> str:
     """How a map differs from those before; "" = not at all."""
-    if measured.radius > 0.0 and abs(measured.radius - working_radius) > tolerance * working_radius:
-        return (
-            f"aperture radius {measured.radius * 1e3:.3f} mm, the mirror's is {working_radius * 1e3:.3f} mm "
-            f"+-{tolerance:.1%}: never mix apertures in one fit, set the "
-            "interferometer's aperture.radius to the mirror's"
-        )
-    if outcome.setup and (different := _other_setup(measured, outcome.setup)):
-        return different
+    if different := other_aperture(measured, working_radius, tolerance, "the mirror's is"):
+        return f"{different}: never mix apertures in one fit, set the interferometer's aperture.radius to the mirror's"
+    if (setup := outcome.setup) is not None:
+        if not same_points(measured.points, setup.points):
+            return "sampled at other points than the maps before: measure the whole run with one interferometer node"
+        if different := other_setup(measured, setup, _PROPERTIES, "in the maps before"):
+            return f"{different}: never mix them in one fit, measure the whole run with one instrument and its settings"
     first = outcome.records[0] if outcome.records else measured
     if measured.coefficients.shape != first.coefficients.shape:
         return f"{measured.coefficients.size} Zernike terms, in the maps before {first.coefficients.size}"
@@ -61,42 +102,5 @@ def _difference(measured: Measurement, outcome: Outcome, working_radius: float, 
         return (
             f"aperture radius {measured.radius_px:.1f} pixels, in the maps before {first.radius_px:.1f}: the map "
             "shows a part of the pupil, or another one"
-        )
-    return ""
-
-
-def _other_setup(measured: Measurement, setup: Setup) -> str:
-    """How a map differs in setup from those before; "" = not at all."""
-    if not same_points(measured.points, setup.points):
-        return "sampled at other points than the maps before: measure the whole run with one interferometer node"
-    if abs(measured.wavelength - setup.wavelength) > WAVELENGTH_TOLERANCE * setup.wavelength:
-        return (
-            f"wavelength {measured.wavelength * 1e9:.3f} nm, in the maps before {setup.wavelength * 1e9:.3f} nm (0 = "
-            "not known): never mix wavelengths in one fit, measure the whole run with one instrument"
-        )
-    mixed = "never mix instruments in one fit, measure the whole run with one"
-    if measured.instrument != setup.instrument:
-        return f"instrument {measured.instrument!r}, in the maps before {setup.instrument!r}: {mixed}"
-    if measured.camera != setup.camera:
-        here, before = ("{} x {}".format(*size) for size in (measured.camera, setup.camera))
-        return f"camera of {here} pixels, in the maps before {before}: {mixed}"
-    if not np.isclose(measured.pitch, setup.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
-        before = f"{setup.pitch * 1e6:.3f} um (0 = not known)"
-        return f"pixel pitch {measured.pitch * 1e6:.3f} um, in the maps before {before}: {mixed}"
-    if measured.orientation != setup.orientation:
-        here, before = (
-            "flip_x {}, flip_y {}, rotate_deg {:g}".format(*each) for each in (measured.orientation, setup.orientation)
-        )
-        return (
-            f"orientation {here}, in the maps before {before}: do not change the interferometer's orientation.* in a "
-            "run"
-        )
-    if measured.reference_surface != setup.reference_surface:
-        here, before = (each or "none" for each in (measured.reference_surface, setup.reference_surface))
-        return f"reference_surface {here}, in the maps before {before}: do not change it in a run"
-    if measured.system_error_subtracted != setup.system_error_subtracted:
-        return (
-            f"system_error_subtracted = {measured.system_error_subtracted}, in the maps before "
-            f"{setup.system_error_subtracted} (1 = the instrument had subtracted its own error): never mix them"
         )
     return ""

@@ -14,7 +14,7 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
-from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
+from dm_calibration.procedure.map_comparison import other_aperture, other_setup
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described, without_response, worst_other_error
@@ -235,28 +235,12 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             "the map is sampled at other points than the calibration, made with another interferometer node or "
             "version: calibrate anew"
         )
-    if not abs(measured.wavelength - calibration.wavelength) <= WAVELENGTH_TOLERANCE * calibration.wavelength:
-        raise MapNotUsableError(
-            f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
-            f"{calibration.wavelength * 1e9:.3f} nm (0 = not known)"
-        )
-    if measured.reference_surface != calibration.reference_surface:
-        raise MapNotUsableError(
-            f"reference_surface {measured.reference_surface or 'none'}, the calibration was made with "
-            f"{calibration.reference_surface or 'none'}"
-        )
-    subtracted = measured.system_error_subtracted, calibration.system_error_subtracted
-    if -1 not in subtracted and subtracted[0] != subtracted[1]:
-        raise MapNotUsableError(
-            f"system_error_subtracted = {subtracted[0]}, in the calibration's maps {subtracted[1]} (1 = the instrument "
-            "had subtracted its own error): set the instrument as it was"
-        )
-    radius, tolerance = calibration.aperture_radius, options.aperture_tolerance
-    if measured.radius and not abs(measured.radius - radius) <= tolerance * radius:
-        raise MapNotUsableError(
-            f"aperture radius {measured.radius * 1e3:.3f} mm, the calibration's is {radius * 1e3:.3f} mm "
-            f"+-{tolerance:.1%}"
-        )
+    known = -1 not in (measured.system_error_subtracted, calibration.system_error_subtracted)
+    names = ("wavelength", "reference_surface", *(("system_error_subtracted",) if known else ()))
+    whose, tolerance = "the calibration's is", options.aperture_tolerance
+    different = other_setup(measured, calibration, names, whose)
+    if different := different or other_aperture(measured, calibration.aperture_radius, tolerance, whose):
+        raise MapNotUsableError(different)
     seen, least = float(np.isfinite(measured.sag) @ calibration.fit.points.weight), options.valid_fraction_min
     for share, text in ((measured.valid_fraction, "the pixels are valid"), (seen, "the sampled area has data")):
         if not share >= least:

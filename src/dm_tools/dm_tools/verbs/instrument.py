@@ -79,15 +79,15 @@ def instrument(
 def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
     """Write the error of the flat that is the first reference in `table`."""
     from dm_calibration.map_files.fits import fits_bytes
+    from dm_calibration.map_files.surface_map import SAME_LENGTH
     from dm_calibration.optics.flats import FlatTest, reference_from_flats
-    from dm_calibration.procedure.map_comparison import WAVELENGTH_TOLERANCE
 
     rows = _table(table, "file", "reference", "part", "degrees")
     sources = [table.parent / row[0] for row in rows]
     if target.resolve() in [source.resolve() for source in (table, *sources)]:
         raise ValueError(f"--write {target}: is one of the files to read; give another")
     surfaces = [read(source) for source in sources]
-    tolerance = WAVELENGTH_TOLERANCE * surfaces[0].wavelength
+    tolerance = SAME_LENGTH * surfaces[0].wavelength
     for source, surface in zip(sources, surfaces, strict=True):
         if different := surface.difference(surfaces[0], 0.0, tolerance, str(sources[0])):
             raise ValueError(f"{source}: {different}")
