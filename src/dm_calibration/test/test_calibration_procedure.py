@@ -76,7 +76,7 @@ def test_degausses_in_the_course_of_a_run_begin_no_new_one(bench: LinearBench, m
     assert not maps.segment.any() and not maps.reference[maps.label.index("reference 2")]
     assert (maps.moved_s()[[first, second]] == 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])[[first - 1, second - 1]]).all()
 
-    del outcome.records[second:], outcome.centres[second:]
+    del outcome.records[second:]
     again = Procedure(plan, mirror, bench, outcome=outcome).run()
     assert [move.degauss for move in bench.moves].count(True) == 5  # as a run goes on, and its own
     assert again.maps().degaussed.sum() == 2
@@ -93,9 +93,9 @@ def test_what_a_degauss_wiped_is_no_noise(bench: LinearBench, mirror: Mirror) ->
 
 
 def test_a_reference_frame_may_differ_by_what_a_degauss_wiped(bench: LinearBench, mirror: Mirror) -> None:
-    reference, poke = (MapTaken(record) for record in run(bench, mirror).outcome.records[:2])
-    change = 0.8 * (poke.record.coefficients - reference.record.coefficients)
-    changed = MapTaken(replace(reference.record, coefficients=reference.record.coefficients + change))
+    reference, poke = run(bench, mirror).outcome.records[:2]
+    change = 0.8 * (poke.coefficients - reference.coefficients)
+    changed = replace(reference, coefficients=reference.coefficients + change)
     check = BumpCheck(BumpOptions(tilt_max=0.0), mirror, 0.1)
     check.take(reference)
     check.take(poke)
@@ -252,9 +252,9 @@ def test_where_a_coarse_map_ends_is_not_known_to_a_pixel(pitch: float, mirror: M
         np.zeros(300), 1, kind="reference", radius_px=100.0, pitch=pitch
     )
     check = BumpCheck(BumpOptions(), mirror, 0.1)
-    check.take(MapTaken(frame, centre=(0.0, 0.0)))
-    assert check.change(MapTaken(frame, centre=(1.2 * 1.1e-4, 0.0)), False) == ""
-    assert "the mirror moved by" in check.change(MapTaken(frame, centre=(2.0 * 1.1e-4, 0.0)), False)
+    check.take(replace(frame, centre=(0.0, 0.0)))
+    assert check.change(replace(frame, centre=(1.2, 0.0)), False) == ""
+    assert "the mirror moved by" in check.change(replace(frame, centre=(2.0, 0.0)), False)
 
 
 def test_the_figure_of_a_mirror_of_one_actuator_is_compared_too() -> None:

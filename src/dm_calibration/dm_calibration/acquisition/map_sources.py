@@ -110,7 +110,7 @@ def outcome_of(
                     without_map(one, label="degauss", stamp_ns=(one.moved_ns or one.stamp_ns) - 10**9, **begin)
                 )
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
-        outcome.take(MapTaken(one, one.radius > 0.0))
+        outcome.take(MapTaken(one))
     return outcome
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dm_calibration.influence.maps import StepKind
-from dm_calibration.procedure.outcome import MapTaken
 from dm_common import Floats
+from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_common.values import live_parameter, real
@@ -49,21 +49,20 @@ class BumpCheck:
         """`allowance`: error of an actuator by hysteresis, as a share of its move."""
         self._options, self._allowance = options, allowance
         self._rest, self._half_range, self._radius = mirror.rest, mirror.limits.half_range, mirror.working_radius
-        self._last: MapTaken | None = None
+        self._last: Measurement | None = None
         self._moved = np.zeros_like(self._rest)
         # Sums of squares: change in the maps (rms, m) and commanded change. The root of their ratio is the response.
         self._shown = self._commanded = 0.0
 
-    def take(self, taken: MapTaken) -> None:
+    def take(self, record: Measurement) -> None:
         """Take a good map; later reference frames are compared with it."""
-        record = taken.record
         if record.kind == StepKind.REFERENCE:
-            self._last = taken
+            self._last = record
             self._moved = np.zeros_like(self._moved)
             return
         self.moved(record.applied)
         if self._last is not None and np.isfinite(record.coefficients).all():
-            self._shown += _figure_rms(record.coefficients - self._last.record.coefficients) ** 2
+            self._shown += _figure_rms(record.coefficients - self._last.coefficients) ** 2
             away = record.applied - self._rest
             # A signal common to all actuators lifts the plate without bending it.
             self._commanded += float(np.square(away - (away.mean() if len(away) > 1 else 0.0)).sum())
@@ -76,7 +75,7 @@ class BumpCheck:
         """Note that all actuators have moved through their whole range."""
         self._moved = np.maximum(self._moved, self._half_range)
 
-    def change(self, frame: MapTaken, interrupted: bool) -> str:
+    def change(self, frame: Measurement, interrupted: bool) -> str:
         """How the reference frame `frame` differs from the one before it; "" = within the allowed changes.
 
         Args:
@@ -84,16 +83,16 @@ class BumpCheck:
         """
         if self._last is None:
             return ""
-        last, options = self._last.record, self._options
-        difference = frame.record.coefficients - last.coefficients
+        last, options = self._last, self._options
+        difference = frame.coefficients - last.coefficients
         tilt = float(np.hypot(difference[1], difference[2]))
         if options.tilt_max and not interrupted and tilt > options.tilt_max:
             return (
                 f"the tilt changed by {tilt * 1e6:.2f} um at the edge since {last.label} "
                 f"(bump.tilt_max {options.tilt_max * 1e6:.2f} um)"
             )
-        shift = math.dist(frame.centre, self._last.centre)
-        pixel = self._radius / frame.record.radius_px if frame.record.radius_px > 0.0 else 0.0
+        shift = math.dist(self._centre(frame), self._centre(last))
+        pixel = self._radius / frame.radius_px if frame.radius_px > 0.0 else 0.0
         if options.shift_max and shift > max(options.shift_max, _WANDER_PX * pixel):
             return (
                 f"the mirror moved by {shift * 1e3:.3f} mm on the map since {last.label} "
@@ -107,6 +106,10 @@ class BumpCheck:
                 f"{options.figure_max * 1e9:.0f} nm and up to {left * 1e9:.0f} nm that hysteresis may have left)"
             )
         return ""
+
+    def _centre(self, record: Measurement) -> Floats:
+        """(2,) m, centre of the aperture on a map; NaN = not known."""
+        return np.array(record.centre) * (self._radius / record.radius_px if record.radius_px > 0.0 else np.nan)
 
     def _left_behind(self) -> float:
         """The largest rms sag that hysteresis may have left since the last reference frame, m."""

@@ -17,9 +17,6 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 
-#: A position that is not known.
-NOWHERE = (float("nan"), float("nan"))
-
 
 @dataclass(frozen=True)
 class Setup:
@@ -57,16 +54,9 @@ class Segment:
 
 @dataclass(frozen=True)
 class MapTaken:
-    """A map was measured.
-
-    Attributes:
-        radius_known: whether the map contains its aperture radius.
-        centre: of the aperture on the map, m; NaN = not known.
-    """
+    """A map was measured."""
 
     record: Measurement
-    radius_known: bool = True
-    centre: tuple[float, float] = NOWHERE
 
 
 @dataclass(frozen=True)
@@ -120,17 +110,14 @@ class Outcome:
         setup: properties that all maps share; None before the first map.
         dropped: "label: reason" of each map or state that could not be measured.
         remarks: deviations of the measurements from the request.
-        centres: of the aperture on each map of `records`, m; NaN = not known.
     """
 
     records: list[Measurement] = field(default_factory=list)
     setup: Setup | None = None
-    radius_known: bool = True
     dropped: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
     segment: int = 0
-    centres: list[tuple[float, float]] = field(default_factory=list)
     # Each drop, and the number of records before it.
     _drops: list[tuple[int, Dropped]] = field(default_factory=list)
     # Number of events since the last map: drops, and commands without a map.
@@ -145,11 +132,10 @@ class Outcome:
             case Segment():
                 self._begin(event.number)
             case MapTaken():
-                self._add(event.record, event.centre)
-                self.radius_known &= event.radius_known
+                self.records.append(event.record)
                 self._failing = self._unseen = 0
             case Unseen():
-                self._add(event.record, NOWHERE)
+                self.records.append(event.record)
                 self._unseen += 1
             case Dropped():
                 self.dropped.append(event.reason)
@@ -161,6 +147,11 @@ class Outcome:
                     self.remarks += [event.remark] if event.remark else []
             case Doubted():
                 self._doubt(event)
+
+    @property
+    def radius_known(self) -> bool:
+        """Whether all maps contain their aperture radius."""
+        return all(record.radius > 0.0 for record in self.records)
 
     def tried(self, step: int) -> int:
         """Number of maps of the state `step` that were taken or given up."""
@@ -185,16 +176,12 @@ class Outcome:
             solved &= np.isfinite(maps.nominal).any(axis=1)
         return maps.select(~np.logical_or.accumulate(solved))
 
-    def _add(self, record: Measurement, centre: tuple[float, float]) -> None:
-        self.records.append(record)
-        self.centres.append(centre)
-
     def _begin(self, number: int) -> None:
         """Begin a segment. The last failures are forgotten and tried again: the run may have ended because of them."""
         if number and self._failing:
             del self.dropped[-self._failing :], self._drops[-self._failing :]
         if number and self._unseen:
-            del self.records[-self._unseen :], self.centres[-self._unseen :]
+            del self.records[-self._unseen :]
         self.segment, self._failing, self._unseen = number, 0, 0
 
     def _doubt(self, event: Doubted) -> None:
@@ -207,5 +194,5 @@ class Outcome:
         for drop in failed:
             self.dropped.remove(drop.reason)
         self._drops = [each for each in self._drops if each[0] < event.kept or each[1].whole]
-        del self.records[event.kept :], self.centres[event.kept :]
+        del self.records[event.kept :]
         self._failing = self._unseen = 0

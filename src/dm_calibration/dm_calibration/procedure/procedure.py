@@ -8,8 +8,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel, model_surface
@@ -29,7 +27,7 @@ from dm_calibration.procedure.outcome import (
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, shape_in_use
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
-from dm_common.measurement import Bench
+from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import APERTURE_TOLERANCE, Mirror
 from dm_common.values import live_parameter, whole
 
@@ -107,8 +105,8 @@ class Procedure:
         self._failures = 0
         self._enough = enough
         self._bump = BumpCheck(self._options.bump, mirror, self._options.fit.hysteresis_allowance)
-        for record, centre in zip(self.outcome.records, self.outcome.centres, strict=True):
-            self._bump.take(MapTaken(record, centre=centre))
+        for record in self.outcome.records:
+            self._bump.take(record)
         self._interrupted = False  # degaussed after an interruption, perhaps also realigned, since the last map
 
     def run(self) -> Outcome:
@@ -242,7 +240,7 @@ class Procedure:
             taken = self._map(step, number, applied)  # a bad map or a moved mirror: a second map decides
             if suspicion := self._bump.change(taken, self._interrupted):
                 self._stop_bumped(step.label, suspicion)
-        self._note(taken)
+        self._note(MapTaken(taken))
         self._bump.take(taken)
         self._interrupted = False
 
@@ -263,7 +261,7 @@ class Procedure:
             "doubt; put the mirror back and start again to go on from the last good reference frame",
         )
 
-    def _map(self, step: Step, number: int, applied: Floats) -> MapTaken:
+    def _map(self, step: Step, number: int, applied: Floats) -> Measurement:
         """Take a map that is comparable with the others."""
         measured = self._bench.measure(step.label)
         self._guard()
@@ -273,7 +271,7 @@ class Procedure:
         if self.outcome.setup is None:
             self._note(Setup.of(measured))
         assert step.signals is not None
-        record = replace(
+        return replace(
             measured,
             label=step.label,
             kind=step.kind.value,
@@ -283,8 +281,6 @@ class Procedure:
             nominal=step.nominal,
             segment=self.outcome.segment,
         )
-        metres = self._mirror.working_radius / measured.radius_px if measured.radius_px > 0.0 else np.nan
-        return MapTaken(record, measured.radius > 0.0, (measured.centre[0] * metres, measured.centre[1] * metres))
 
     def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
         """If hysteresis is to be identified, keep a command without a map: it is part of the actuators' history.
