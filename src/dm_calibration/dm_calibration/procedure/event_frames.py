@@ -6,7 +6,6 @@ the frame before it: no frame can get lost between two others, or be inserted fr
 
 import hashlib
 import json
-import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
@@ -85,7 +84,8 @@ def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Ev
         if "record" in values:
             if setup is None:
                 raise KeyError("points")
-            values["record"] = Measurement(**{name: getattr(setup, name) for name in _SHARED} | values["record"])
+            shared = {name: getattr(setup, name) for name in _SHARED}
+            values = {"record": Measurement(**shared | values["record"])}  # before 0.2 a frame held more of its map
         if "points" in values:
             values["points"] = SamplePoints(**values["points"])
         event: Event | Storing = _EVENTS[head["event"]](**values)
@@ -99,8 +99,6 @@ def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name in _RECORD if isinstance(value, Measurement) else [field.name for field in fields(value)]:
         item = getattr(value, name)
-        if name == "temperature" and math.isnan(item):
-            continue  # left out, as in journals older than this field
         if isinstance(item, np.ndarray):
             place = sum(map(len, arrays))
             arrays.append(np.ascontiguousarray(item, dtype="<f8").tobytes())
