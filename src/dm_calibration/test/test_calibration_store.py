@@ -19,13 +19,13 @@ from dm_calibration.calibration import Calibration, CalibrationFileError, to_col
 from dm_calibration.calibrator import Provenance, calibrate, refit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.procedure.outcome import Outcome, Setup
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError
 from dm_common.errors import UnknownNameError
-from dm_common.measurement import Measurement
+from dm_common.measurement import Measurement, Setup
 from linear_mirror import LinearMirror, make_mirror
 
 MIRROR = make_mirror(rings=1, serial="S 7/é")

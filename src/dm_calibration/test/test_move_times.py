@@ -40,7 +40,15 @@ def test_a_later_move_has_crept_less() -> None:
 def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
     points = edge_clustered_points(30)
     record = Measurement(
-        points, np.zeros(30), np.zeros(21), np.zeros(21), 10**9, 0.0, 1.0, signals=np.zeros(2), applied=np.zeros(2)
+        points=points,
+        sag=np.zeros(30),
+        coefficients=np.zeros(21),
+        sigma=np.zeros(21),
+        stamp_ns=10**9,
+        residual_rms=0.0,
+        valid_fraction=1.0,
+        signals=np.zeros(2),
+        applied=np.zeros(2),
     )
     times = [
         (1, 0),

@@ -24,10 +24,10 @@ from dm_calibration.influence.weights import (
     region_weights,
     surface_control_error,
 )
-from dm_calibration.procedure.outcome import Outcome, Setup
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_common.errors import UnknownNameError
-from dm_common.measurement import Measurement
+from dm_common.measurement import Measurement, Setup
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import EmptyRegionError, command_row_weights, point_weights, regional_rms
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points

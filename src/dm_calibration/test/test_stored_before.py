@@ -15,7 +15,6 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.hysteresis.features import follow
-from dm_calibration.procedure.outcome import Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.resumable_run import identity_of, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
@@ -23,6 +22,7 @@ from dm_calibration.recalibration.drift import UpdateOptions
 from dm_calibration.recalibration.updates import RecalibrationManager
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common import Floats
+from dm_common.measurement import Setup
 from dm_common.messages import hysteresis_model_from
 from linear_mirror import make_mirror
 from map_hashes import record_hash

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.procedure.outcome import Outcome, Setup
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.geometry import neighbour_pairs
 from dm_common.limits import Limits
-from dm_common.measurement import Measurement
+from dm_common.measurement import Measurement, Setup
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis

@@ -16,7 +16,7 @@ from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.procedure.map_comparison import check_comparable
-from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup, without_map
+from dm_calibration.procedure.outcome import MapTaken, Outcome, without_map
 from dm_common import Bools, Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
@@ -102,7 +102,7 @@ def outcome_of(
         except MeasurementError as error:
             raise MeasurementError(error.error_code, f"{label}: {error}") from error
         if outcome.setup is None:
-            outcome.take(Setup.of(one))
+            outcome.take(one.setup)
             if hysteresis and kind != StepKind.REFERENCE and mirror.limits.middle:
                 # No map shows the mirror after the degauss, at mid range: not 0 on a mirror driven in one direction.
                 begin = {"kind": StepKind.REFERENCE, "step": -1, "signals": rest, "applied": rest}

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.procedure.outcome import Doubted, Dropped, Event, MapTaken, Segment, Setup, Solved, Unseen
-from dm_common.measurement import Measurement
+from dm_calibration.procedure.outcome import Doubted, Dropped, Event, MapTaken, Segment, Solved, Unseen
+from dm_common.measurement import Measurement, Setup
 from dm_common.optics.sampling import SamplePoints
 
 _MARK = b"DMJ1"

@@ -7,36 +7,14 @@ Everything that happens in a run is an event. A live run takes its events one by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_common.measurement import Measurement
-from dm_common.optics.sampling import SamplePoints
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The first map came; all maps must share these properties, see :class:`~dm_common.measurement.Measurement`."""
-
-    points: SamplePoints
-    wavelength: float
-    system_error_subtracted: int
-    instrument: str = ""
-    pitch: float = 0.0
-    camera: tuple[int, int] = (0, 0)
-    orientation: tuple[bool, bool, float] = (False, False, 0.0)
-    reference_surface: str = ""
-    instrument_error: float = 0.0
-    scale_error: float = 0.0
-
-    @classmethod
-    def of(cls, measured: Measurement) -> Setup:
-        """The setup that `measured` was taken with."""
-        return cls(**{shared.name: getattr(measured, shared.name) for shared in fields(cls)})
+from dm_common.measurement import Measurement, Setup
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from dm_calibration.procedure.outcome import (
     MapTaken,
     Outcome,
     Segment,
-    Setup,
     Solved,
     without_map,
 )
@@ -269,7 +268,7 @@ class Procedure:
         if self._plan.kind is PlanKind.HYSTERESIS:
             check_not_earlier(measured, self.outcome)
         if self.outcome.setup is None:
-            self._note(Setup.of(measured))
+            self._note(measured.setup)
         assert step.signals is not None
         return replace(
             measured,
