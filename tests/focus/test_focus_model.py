@@ -156,7 +156,7 @@ def test_sag_and_coefficients_agree() -> None:
 def test_inconsistent_calibrations_are_refused(mirror: LinearMirror) -> None:
     good = perfect_model(mirror, 0.0)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
-    with pytest.raises(ValueError, match="sag_offset has shape"):
+    with pytest.raises(ValueError, match="sag_offset has the shape"):
         InfluenceModel(**{**fields, "sag_offset": np.zeros(3)})
     with pytest.raises(ValueError, match="influence_sag holds values that are not finite"):
         InfluenceModel(**{**fields, "influence_sag": np.full_like(mirror.influence, np.nan)})
@@ -173,5 +173,5 @@ def test_a_mirror_most_of_which_does_nothing_still_focuses(mirror: LinearMirror,
 @pytest.mark.parametrize("terms", [0, 1, 20])
 def test_another_number_of_terms_is_refused_by_name(mirror: LinearMirror, terms: int) -> None:
     model = perfect_model(mirror, 0.0)
-    with pytest.raises(ValueError, match=f"influence_zernike has {terms} terms, must have 21"):
+    with pytest.raises(ValueError, match=rf"influence_zernike has the shape \({terms}, 37\): must be \(21, 37\)"):
         replace(model, influence_zernike=model.influence_zernike[:terms], zernike_offset=model.zernike_offset[:terms])

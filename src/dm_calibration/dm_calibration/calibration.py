@@ -20,6 +20,7 @@ from dm_common.hysteresis.model import REQUEST_ERROR_RATIO
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
+from dm_common.values import check_array
 
 SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
@@ -203,11 +204,11 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
             recipes=recipes_from(columns),
             region_weights=np.asarray(columns.get("regions/weights", np.zeros(0)), dtype=np.float64),
         )
+        _check_result(calibration)
     except KeyError as error:
         raise CalibrationFileError(f"{error.args[0]} is missing") from error
     except (TypeError, ValueError) as error:
         raise CalibrationFileError(str(error)) from error
-    _check_result(calibration)
     return calibration
 
 
@@ -219,7 +220,7 @@ def _typed(attributes: Mapping[str, Attribute], name: str, kind: type) -> Attrib
 
 
 def _check_result(calibration: Calibration) -> None:
-    """Check shapes and finiteness of all values that a controller uses."""
+    """Check shapes and finiteness of all values that a controller uses. Raises ValueError."""
     fit, maps = calibration.fit, calibration.maps
     n, k, p, m = maps.actuators, maps.terms, maps.points.x.size, len(maps)
     shapes = {
@@ -235,28 +236,23 @@ def _check_result(calibration: Calibration) -> None:
         "map_residual": (m,),
     }
     for name, shape in shapes.items():
-        value = getattr(fit, name)
-        if not isinstance(value, np.ndarray) or value.shape != shape:
-            raise CalibrationFileError(f"result/{name} has the shape {np.shape(value)}: must be {shape}")
-        if name != "map_residual" and not np.isfinite(value).all():
-            raise CalibrationFileError(f"result/{name} holds values that are not finite")
+        check_array(f"result/{name}", getattr(fit, name), shape, finite=name != "map_residual")
     if not np.isin(fit.grades, range(len(GRADE_NAMES))).all():
-        raise CalibrationFileError(f"result/grades: must be 0 to {len(GRADE_NAMES) - 1}")
+        raise ValueError(f"result/grades: must be 0 to {len(GRADE_NAMES) - 1}")
     if len(fit.reasons) != m:
-        raise CalibrationFileError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
-    if calibration.actuator_x.shape != (n,) or calibration.actuator_y.shape != (n,):
-        raise CalibrationFileError(f"mirror/actuator_x and actuator_y: must have {n} values each")
-    if calibration.hysteresis is not None and calibration.hysteresis.zernike_sigma.shape != (k,):
-        raise CalibrationFileError(f"memory/zernike_sigma: must have {k} values")
+        raise ValueError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
+    for name in ("actuator_x", "actuator_y"):
+        check_array(f"mirror/{name}", getattr(calibration, name), (n,))
+    for name in _POINTS:
+        check_array(f"points/{name}", getattr(maps.points, name), (p,))
+    if calibration.hysteresis is not None:
+        check_array("memory/zernike_sigma", calibration.hysteresis.zernike_sigma, (k,))
+    for recipe in calibration.recipes.recipes:
+        check_array("recipes/effective", recipe.effective, (n,))
     weights = calibration.region_weights
     if weights.size and not (
         weights.shape == (len(AREA_FRACTIONS),) and np.all(weights > 0.0) and np.all(weights <= 1.0)
     ):
-        raise CalibrationFileError(f"regions/weights: must be {len(AREA_FRACTIONS)} numbers above 0, at most 1")
-    if any(recipe.effective.shape != (n,) for recipe in calibration.recipes.recipes):
-        raise CalibrationFileError(f"recipes/effective: must have {n} signals each")
-    for name in _POINTS:
-        if not np.isfinite(getattr(maps.points, name)).all():
-            raise CalibrationFileError(f"points/{name} holds values that are not finite")
+        raise ValueError(f"regions/weights: must be {len(AREA_FRACTIONS)} numbers above 0, at most 1")
     if not calibration.aperture_radius > 0.0:
-        raise CalibrationFileError(f"aperture_radius = {calibration.aperture_radius}: must be positive, m")
+        raise ValueError(f"aperture_radius = {calibration.aperture_radius}: must be positive, m")

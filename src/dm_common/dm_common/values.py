@@ -158,6 +158,14 @@ def check_parameters(of: Any) -> None:
             each.metadata["value"].check(each.name, getattr(of, each.name))
 
 
+def check_array(name: str, given: Any, shape: tuple[int, ...], finite: bool = True) -> None:
+    """Raise ValueError unless `given` is an array of this `shape` and, if `finite`, of finite numbers, naming it."""
+    if not isinstance(given, np.ndarray) or given.shape != shape:
+        raise ValueError(f"{name} has the shape {np.shape(given)}: must be {shape}")
+    if finite and not np.isfinite(given).all():
+        raise ValueError(f"{name} holds values that are not finite")
+
+
 class Fields:
     """Checks of all fields of a request or goal, by a table {name: allowed values}; dots lead into nested messages."""
 

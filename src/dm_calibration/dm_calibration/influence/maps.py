@@ -13,6 +13,7 @@ from dm_common import Bools, Floats, Ints
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
+from dm_common.values import check_array
 
 #: Assumed time from the end of a degauss to the first map, s, if not known; it affects only creep that soon ends.
 BEFORE_FIRST_MAP_S = 1.0
@@ -81,8 +82,7 @@ class MapSet:
         )
         for shape, names in expected:
             for name in names:
-                if getattr(self, name).shape != shape:
-                    raise ValueError(f"{name} has the shape {getattr(self, name).shape}: must be {shape}")
+                check_array(name, getattr(self, name), shape, finite=False)
         for name in ("label", "kind", "file", "sha256"):
             if len(getattr(self, name)) != count:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries: must be {count}")

@@ -13,6 +13,7 @@ from dm_calibration.influence.registration import Registration, bumps, only_term
 from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch, rings
 from dm_common.optics.sampling import SamplePoints
+from dm_common.values import check_array
 
 #: Turn (rad), shift (share of the pitch) and relative change of scale that still count as configured.
 TURN_MAX = np.radians(1.5)
@@ -94,8 +95,7 @@ def check_pokes(
         unmoved: (N,) actuators that were not driven, which make no finding.
     """
     count = x.size
-    if response.shape != (len(points), count):
-        raise ValueError(f"response has the shape {response.shape}: must be {(len(points), count)}")
+    check_array("response", response, (len(points), count), finite=False)
     unit, size = unit_responses(response.T, points)
     quiet = (silent | (size == 0.0)) & ~unmoved
     active = np.flatnonzero(~(quiet | unmoved))

@@ -12,6 +12,7 @@ from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis, curvature_of_defocus, tilt_influence
+from dm_common.values import check_array
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
 
 #: Weight of a coefficient relative to the sag beyond the terms. Large enough to act as an equality while the limits
@@ -58,23 +59,18 @@ class InfluenceModel:
     actuator_y: Floats | None = None
 
     def __post_init__(self) -> None:
-        terms, actuators = self.influence_zernike.shape
-        points = len(self.sample_x)
-        if terms != len(TERMS):
-            raise ValueError(f"calibration: influence_zernike has {terms} terms, must have {len(TERMS)}")
+        terms, points, actuators = len(TERMS), len(self.sample_x), self.influence_zernike.shape[1]
         expected = {
+            "influence_zernike": (terms, actuators),
             "zernike_offset": (terms,),
+            "sample_x": (points,),
             "sample_y": (points,),
             "sample_weight": (points,),
             "influence_sag": (points, actuators),
             "sag_offset": (points,),
         }
         for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"calibration: {name} has shape {getattr(self, name).shape}, must be {shape}")
-        for name in ("influence_zernike", "sample_x", *expected):
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"calibration: {name} holds values that are not finite")
+            check_array(f"calibration: {name}", getattr(self, name), shape)
         if not self.aperture_radius > 0:
             raise ValueError(f"calibration: aperture_radius = {self.aperture_radius:g}: must be positive")
 

@@ -18,6 +18,7 @@ from dm_common.limits import SLACK, Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
+from dm_common.values import check_array
 from dm_controller.planning.mirror_model import InfluenceModel, target_shape
 from dm_controller.planning.target import FocusTarget, Shape
 
@@ -100,9 +101,7 @@ class Solver(ABC):
             ValueError: signals or a shape of other size than the model's, or not finite.
         """
         self._check(error)
-        count = self.model.influence_zernike.shape[1]
-        if signals.shape != (count,) or not np.isfinite(signals).all():
-            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
+        check_array("signals", signals, self.model.influence_zernike.shape[1:])
         return self.limited(self._corrected(signals, error))
 
     def _corrected(self, signals: Floats, error: Shape) -> Floats:
@@ -114,14 +113,8 @@ class Solver(ABC):
         """Signals (N,), inside the limits or not, that change the surface by `change` from where `start` holds it."""
 
     def _check(self, shape: Shape) -> None:
-        for name, value, size in (
-            ("coefficients", shape.coefficients, self.model.zernike_offset.size),
-            ("sag", shape.sag, self.model.sag_offset.size),
-        ):
-            if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(
-                    f"{name} of shape {value.shape}: must be {size} finite numbers, as many as the calibration has"
-                )
+        check_array("coefficients", shape.coefficients, self.model.zernike_offset.shape)
+        check_array("sag", shape.sag, self.model.sag_offset.shape)
 
     def limited(self, signals: Floats) -> Command:
         """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""
