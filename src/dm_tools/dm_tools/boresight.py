@@ -105,5 +105,5 @@ def run_boresight(
         write_parameters(parameters, write, source, namespace, ("autofocus",))
     else:
         console.print("in use until the node ends; to keep it, put into its parameter file (--write FILE does it):")
-        console.print(parameters, markup=False, highlight=False)
+        console.print(parameters, markup=False)
     next_step("./dm focus 0.02", namespace)

@@ -29,11 +29,9 @@ class _Screen(Console):
         return super().render_str(escaped, markup=markup, **how)
 
 
-#: Lines are not wrapped in a pipe or a file.
-console = _Screen(
-    highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120, soft_wrap=not sys.stdout.isatty()
-)
-errors = Console(stderr=True, highlight=False, emoji=False)
+#: Lines are not wrapped here: a terminal does that itself, and files and pipes need them whole.
+console = _Screen(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 
 #: The value of `--json` for standard output.
 STANDARD_OUTPUT = Path("-")
@@ -101,8 +99,7 @@ class NotRunningError(RuntimeError):
 
 def fail(message: str) -> None:
     """Say what went wrong on standard error."""
-    errors.print("[bold red]error:[/]", end=" ")
-    errors.print(message, soft_wrap=True, markup=False)
+    errors.print("[bold red]error:[/]", Text(message))
 
 
 def in_namespace(text: str, namespace: str) -> str:
@@ -116,7 +113,7 @@ def in_namespace(text: str, namespace: str) -> str:
 
 def next_step(text: str, namespace: str = "") -> None:
     """Print the last line of a command: what to do next."""
-    console.print(f"[dim]next: {in_namespace(text, namespace)}[/]", soft_wrap=True)
+    console.print(f"[dim]next: {in_namespace(text, namespace)}[/]")
 
 
 def progress_bar(steady: bool = True) -> Progress:

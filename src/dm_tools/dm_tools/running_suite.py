@@ -52,7 +52,7 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
 
     with DeformableMirrorClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), FIND_S):
-            errors.print(f"no node of the suite found yet {where(client)}: ./dm up starts it", soft_wrap=True)
+            errors.print(f"no node of the suite found yet {where(client)}: ./dm up starts it")
             if not client.wait(lambda: nodes_of_suite(client), BUSY_S - FIND_S):
                 others = {place for name, place in client.node.get_node_names_and_namespaces() if name in NAMES}
                 seen = f"; some are running in {', '.join(sorted(others))} (--namespace)" if others else ""

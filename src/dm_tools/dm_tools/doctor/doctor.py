@@ -5,6 +5,7 @@ from shlex import quote
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
 from dm_tools.doctor.machine import LINK_LOST, Finding, machine_checks
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
@@ -35,12 +36,10 @@ def doctor(
             found = Finding(f"cannot be checked: {error}", "give this user the right to it, or choose another place")
         findings[name] = finding = held_by_the_nodes(name, found, findings.get("nodes that are running"))
         if finding is None or not finding.cure:
-            console.print("[green]ok[/]   ", end=" ")
-            console.print(f"{name}: {finding.problem}" if finding else name, soft_wrap=True, markup=False)
+            console.print("[green]ok[/]   ", Text(f"{name}: {finding.problem}" if finding else name))
         else:
             mark = "[yellow]note[/] " if finding.note else "[red]WRONG[/]"
-            console.print(mark, end=" ")
-            console.print(f"{name}: {finding.problem}\n      cure: {finding.cure}", soft_wrap=True, markup=False)
+            console.print(mark, Text(f"{name}: {finding.problem}\n      cure: {finding.cure}"))
     write_json(json, {"doctor": {name: found and found._asdict() for name, found in findings.items()}})
     if wrong := sum(bool(finding and finding.cure and not finding.note) for finding in findings.values()):
         next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again", namespace)

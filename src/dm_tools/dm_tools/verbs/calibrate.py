@@ -116,16 +116,16 @@ def show_result(result: Any, calibration: Any = None) -> None:
             f"held out{beforehand}; hysteresis {result.hysteresis_model}"
         )
     if calibration is not None:
-        console.print(f"when flat: {accuracy_text(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
+        console.print(f"when flat: {accuracy_text(promise_of(calibration), calibration, 0.0)}")
     if warning := warning_in(result):
-        console.print(f"[yellow]{warning}[/]", soft_wrap=True)
+        console.print(f"[yellow]{warning}[/]")
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
     for entry in result.poke_findings:
         console.print(f"[yellow]poke check[/] {entry}")
     if result.parameters:
         console.print("poke check: to correct this, put into the parameter file (--write FILE does it):")
-        console.print(result.parameters, markup=False, highlight=False)
+        console.print(result.parameters, markup=False)
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
 
@@ -265,7 +265,7 @@ def calibrate(
             set_parameter(client, "calibration", "start_fresh", True)
         try:
             if not dry_run and plan == CalibrationPlan.hysteresis:
-                console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
+                console.print(f"expected: {expected_run(client, goal)}")
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
             nodes = nodes_of_suite(client) if source is not None else ()  # only now: at first not all are heard

@@ -69,16 +69,15 @@ def check(
         if lost:
             console.print(
                 "[yellow]compared with the state of the actuators that the node `calibration` knows, and not with "
-                f"the shape requested: focus_controller does not know their history ({lost})[/]",
-                soft_wrap=True,
+                f"the shape requested: focus_controller does not know their history ({lost})[/]"
             )
         beyond = " beyond what is predicted" if shape is not None and shape.predicted >= MENTIONED else ""
         console.print(f"largest coefficient{beyond}: {verdict(promised, response.max_zernike)}")
-        console.print(accuracy_text(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
+        console.print(accuracy_text(promised, calibration, shape.curvature if shape else 0.0))
         if not response.accepted:
-            console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
+            console.print(f"[red]the map disagrees with the calibration[/]: {response.message}")
         elif without:
-            console.print(response.message, soft_wrap=True)
+            console.print(response.message)
     maps = f"{response.revision} map{'' if response.revision == 1 else 's'}"
     console.print(
         f"since the calibration was made: {maps} used for updates, gains changed by up to {response.gain_drift:.2%}, "

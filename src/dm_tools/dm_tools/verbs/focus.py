@@ -84,17 +84,14 @@ def _show(state: Any, calibration: Any) -> None:
     console.print(
         f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
         f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient{predicted_part}; "
-        f"reachable {range_text(state.curvature_min, state.curvature_max, '1/m')}",
-        soft_wrap=True,
+        f"reachable {range_text(state.curvature_min, state.curvature_max, '1/m')}"
     )
     if calibration is not None:
-        console.print(
-            accuracy_text(state.predicted_max_zernike_upper - predicted, calibration, state.curvature), soft_wrap=True
-        )
+        console.print(accuracy_text(state.predicted_max_zernike_upper - predicted, calibration, state.curvature))
     if state.saturated:
         console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
     if remarks := state.message.partition("; ")[2]:
-        console.print(remarks, style="yellow", markup=False, soft_wrap=True)
+        console.print(remarks, style="yellow", markup=False)
 
 
 def _held(state: Any) -> str:

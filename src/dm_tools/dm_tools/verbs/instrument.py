@@ -71,7 +71,7 @@ def instrument(
         found = _retrace([read(file).sag for file in files])
     else:
         found = _grid(files[0], read(files[1]))
-    console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
+    console.print(parameter_text({"interferometer": found}), markup=False)
     write_json(json, {"instrument": found})
     next_step("put the parameters into the parameter file; `instrument_error` is the bound on what is left")
 
@@ -100,15 +100,13 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     write_whole(target, fits_bytes(replace(surfaces[0], sag=found.sag), "dm instrument flats"))
     console.print(
         f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "
-        f"{1e9 * found.left:.2f} nm rms",
-        soft_wrap=True,
+        f"{1e9 * found.left:.2f} nm rms"
     )
     if found.open_orders:
         orders = ", ".join(map(str, found.open_orders))
         console.print(
             f"not determined by these maps, and left out: angular orders {orders} (0 = rotationally symmetric); "
-            "exchange the flats, or turn one by an angle that is no simple fraction of a turn",
-            soft_wrap=True,
+            "exchange the flats, or turn one by an angle that is no simple fraction of a turn"
         )
     # The bound is on coefficients up to this angular order, to which higher orders contribute nothing.
     known = not any(order <= MAX_ORDER for order in found.open_orders) and math.isfinite(found.bound)
@@ -142,8 +140,7 @@ def _grid(table: Path, surface: Any) -> dict[str, Any]:
         )
     console.print(
         f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks deviate from it "
-        f"by {found.left * 1e6:.2f} um rms",
-        soft_wrap=True,
+        f"by {found.left * 1e6:.2f} um rms"
     )
     return {
         "pitch": round(found.pitch, 12),

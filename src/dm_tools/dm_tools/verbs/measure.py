@@ -47,7 +47,7 @@ def measure(
     )
     if found["curvature"] is not None:
         console.print(f"defocus: that of a surface with the curvature {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
-    console.print(f"file: {info.file}", soft_wrap=True)
+    console.print(f"file: {info.file}")
     then = "./dm check compares a map with the calibration in use"
     if reference_sphere is not None:
         found["pitch"] = _scale(info, coefficients, reference_sphere)
@@ -64,11 +64,10 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
     differs = f", {pitch / info.pitch - 1.0:+.3%} against the value in use" if info.pitch > 0.0 else ""
     console.print(
         f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it. "
-        "Add half the relative error of the sphere's radius to scale_error",
-        soft_wrap=True,
+        "Add half the relative error of the sphere's radius to scale_error"
     )
     found = {"pitch": pitch}
     if info.instrument_error > 0.0:
         found["scale_error"] = 1e9 * info.instrument_error * share
-    console.print(parameter_text({"interferometer": found}), markup=False, highlight=False)
+    console.print(parameter_text({"interferometer": found}), markup=False)
     return pitch

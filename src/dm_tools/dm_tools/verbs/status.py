@@ -57,7 +57,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "next": in_namespace(_next(lacking, by, state, calibration, shape, capabilities), namespace),
     }
     for name, text in rows.items():
-        console.print(f"[bold]{name:12s}[/]{text}", soft_wrap=True)
+        console.print(f"[bold]{name:12s}[/]{text}")
     figures = {
         "nodes": list(found),
         "mirror": mirror.serial if mirror is not None else None,
