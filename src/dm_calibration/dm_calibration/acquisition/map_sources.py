@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
-from dm_calibration.hysteresis.response_fit import TIME_MAX_S, between, check_signals, seconds_of
+from dm_calibration.hysteresis.response_fit import TIME_MAX_S, between, check_signals, seconds_of, times_of
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
@@ -66,13 +66,8 @@ def outcome_of(
         )
     check_signals(signals)
     if times is not None:
-        taken = np.asarray(times, dtype=np.float64)
-        if taken.shape != (count,) or not (np.abs(taken) < TIME_MAX_S).all():
-            raise ValueError(
-                f"times has the shape {taken.shape} and goes up to {np.abs(taken).max(initial=0.0):g}: must be "
-                f"({count},) times in s, not ns, up to {TIME_MAX_S:g}"
-            )
-        measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
+        taken = zip(measured, times_of(times, count), strict=True)
+        measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in taken]
     elif not all(one.stamp_ns for one in measured):
         if moved is not None:
             raise ValueError("moved: needs the times of the maps, which neither `times` nor the files state")

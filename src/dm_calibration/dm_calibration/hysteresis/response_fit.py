@@ -180,16 +180,22 @@ def _check_apart(signals: Floats) -> None:
 
 def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:
     """Times since the first measurement, (count,) s: of the measurements and, if known, of the moves."""
-    seconds = np.arange(count, dtype=np.float64) if times is None else seconds_of(times, "times")
+    seconds = np.arange(count, dtype=np.float64) if times is None else times_of(times, count)
+    if moved is None:
+        return seconds - seconds[0], None
+    return seconds - seconds[0], between(seconds_of(moved, "moved"), seconds) - seconds[0]
+
+
+def times_of(times: ArrayLike, count: int) -> Floats:
+    """`times` as (count,) s. Raises ValueError for another number of them, or what cannot be times in s."""
+    seconds = seconds_of(times, "times")
     if seconds.shape != (count,):
         raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), in s")
     if not np.isfinite(seconds).all():
         raise ValueError(f"times: number {_first(~np.isfinite(seconds))} is NaN or infinite")
     if not np.abs(seconds).max() < TIME_MAX_S:
         raise ValueError(f"times go up to {np.abs(seconds).max():g}: must be in s, not ns, up to {TIME_MAX_S:g}")
-    if moved is None:
-        return seconds - seconds[0], None
-    return seconds - seconds[0], between(seconds_of(moved, "moved"), seconds) - seconds[0]
+    return seconds
 
 
 def seconds_of(values: ArrayLike, name: str) -> Floats:
