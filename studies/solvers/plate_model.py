@@ -12,7 +12,7 @@ from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import Shape, Solver, normalised_terms, points_of
+from dm_controller.solvers.base import Shape, Solver, normalised_terms
 from dm_controller.solvers.least_squares import CUTOFF
 
 
@@ -107,7 +107,7 @@ class PlateModel(Solver):
                 f"actuator_x, actuator_y: {actuator_x.size} and {actuator_y.size} values, must be {count} each, one "
                 "per actuator of the calibration"
             )
-        points = points_of(model)
+        points = model.points
         places = model.aperture_radius * np.column_stack([points.x, points.y])
         sag = plate_influence(places, np.column_stack([actuator_x, actuator_y]), properties or PlateProperties())
         sag = remove_piston_tilt(sag.T, points).T

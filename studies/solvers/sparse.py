@@ -33,7 +33,7 @@ class SparseSampling(Solver):
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)
         matrix, self._factors = normalised_terms(model)
-        weighted = np.sqrt(model.sample_weight)[:, None] * model.influence_sag
+        weighted = np.sqrt(model.points.weight)[:, None] * model.influence_sag
         _, singular, right = np.linalg.svd(weighted, full_matrices=False)
         if not singular[0] > 0.0:
             raise ValueError("influence_sag is zero: no actuator moves the surface; calibrate first")

@@ -109,9 +109,7 @@ def few_actuators() -> CalibratedMirror:
     weighted = terms * points.weight[:, None]
     fit = np.linalg.solve(weighted.T @ terms, weighted.T)
     figure = 15e-9 * np.random.default_rng(SEED).standard_normal(21)
-    model = InfluenceModel(
-        radius, fit @ sag, figure, points.x, points.y, points.weight, sag, terms @ figure, 1e-10, 1e-10
-    )
+    model = InfluenceModel(radius, fit @ sag, figure, points, sag, terms @ figure, 1e-10, 1e-10)
     return CalibratedMirror(model, Limits(-1.0, 1.0, neighbour_pairs(plate.x, plate.y), 2.0))
 
 
@@ -122,8 +120,8 @@ def test_terms_that_no_actuator_moves_do_not_spoil_the_surface(curvature: float)
     model = mirror.model
     plan = mirror.plan(FocusTarget(curvature))
     points = edge_clustered_points(500)
-    wanted = FocusTarget(curvature).sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
-    root = np.sqrt(model.sample_weight)
+    wanted = FocusTarget(curvature).sag(model.points.x, model.points.y, model.aperture_radius) - model.sag_offset
+    root = np.sqrt(model.points.weight)
     matrix = root[:, None] * remove_piston_tilt(model.influence_sag.T, points).T
     right = root * remove_piston_tilt(wanted[None, :], points)[0]
     best = np.linalg.lstsq(matrix, right, rcond=1e-12)[0]

@@ -29,7 +29,7 @@ def solved(mirror: CalibratedMirror, target: FocusTarget) -> Plan:
     """The bounded programme for the exact surface less the figure, whatever `plan` and `command` make of it."""
     model = mirror.model
     coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
-    sag = target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
+    sag = target.sag(model.points.x, model.points.y, model.aperture_radius) - model.sag_offset
     tilt = np.array(target.zernike[1:3] or (0.0, 0.0)) - target.curvature * model.aperture_radius * mirror.axis
     return mirror.predict(target, mirror.solve(mirror.rows(Shape(coefficients, sag), tilt)))
 

@@ -156,7 +156,7 @@ def test_theta_is_sparse_and_its_patterns_make_the_change(model: InfluenceModel)
     np.testing.assert_allclose(
         model.influence_zernike[PISTON_TILT:] @ solver.patterns @ theta, change.coefficients[PISTON_TILT:], atol=1e-11
     )
-    single = np.abs(solver.theta(np.zeros(37), Shape(np.zeros(21), np.zeros(len(model.sample_x)))))
+    single = np.abs(solver.theta(np.zeros(37), Shape(np.zeros(21), np.zeros(len(model.points.x)))))
     assert single.max() == 0.0
 
 
@@ -172,12 +172,12 @@ def test_small_corrections_are_as_exact_as_large_ones(mirror: LinearMirror, mode
 
 def test_region_weights_move_the_error_out_of_the_heavy_region(mirror: LinearMirror, model: InfluenceModel) -> None:
     wanted = target_shape(FocusTarget(0.1, zernike=(*[0.0] * 20, 3e-7)), model)
-    inner = np.hypot(model.sample_x, model.sample_y) < 0.5
+    inner = np.hypot(model.points.x, model.points.y) < 0.5
     left = {}
     for name, weights in (("equal", None), ("inner", [1.0] * 3 + [0.05] * 7)):
         signals = AZWreg(model, Limits(-100.0, 100.0, PAIRS, 200.0), weights).solve(wanted).signals
         error = (surface(mirror, signals) - wanted).sag[inner]
-        plane = np.column_stack([np.ones(inner.sum()), model.sample_x[inner], model.sample_y[inner]])
+        plane = np.column_stack([np.ones(inner.sum()), model.points.x[inner], model.points.y[inner]])
         error -= plane @ np.linalg.lstsq(plane, error)[0]
         left[name] = float(np.sqrt(np.mean(error**2)))
     assert left["inner"] < left["equal"]

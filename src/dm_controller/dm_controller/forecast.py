@@ -53,7 +53,7 @@ def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
     from dm_controller.solvers.base import rms_sag  # not needed at the start
 
     moved = response(model, signals)
-    nominal = basis(model.sample_x, model.sample_y) @ moved.coefficients
+    nominal = basis(model.points.x, model.points.y) @ moved.coefficients
     return rms_sag(Shape(model.zernike_offset, model.sag_offset + moved.sag - nominal), model)
 
 

@@ -186,7 +186,7 @@ class FocusRig(DriverRig):
         response.info.valid_fraction = 1.0
         samples = response.samples
         samples.x, samples.y, samples.weight = (
-            doubles(values) for values in (model.sample_x, model.sample_y, model.sample_weight)
+            doubles(values) for values in (model.points.x, model.points.y, model.points.weight)
         )
         samples.sag = doubles(model.sag_offset + model.influence_sag @ signals)
         response.zernike.header.stamp = self.node.get_clock().now().to_msg()

@@ -16,6 +16,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, mirror_from, recipe_book_from, stamp_ns, taken
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
+from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
@@ -168,11 +169,13 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
             raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")
         return values.reshape(rows, actuators)
 
-    names = ("zernike_offset", "sample_x", "sample_y", "sample_weight", "sag_offset")
-    vectors: dict[str, Any] = {name: np.asarray(getattr(calibration, name), dtype=float) for name in names}
+    names = ("sample_x", "sample_y", "sample_weight", "zernike_offset", "sag_offset")
+    *points, zernike_offset, sag_offset = (np.asarray(getattr(calibration, name), dtype=float) for name in names)
     return InfluenceModel(
         **taken(calibration, "aperture_radius", "held_out_rms", "held_out_max_zernike"),
-        **vectors,
+        points=SamplePoints(*points),
+        zernike_offset=zernike_offset,
+        sag_offset=sag_offset,
         influence_zernike=matrix("influence_zernike", len(calibration.zernike_offset)),
         influence_sag=matrix("influence_sag", len(calibration.sag_offset)),
         actuator_x=actuator_x,

@@ -69,7 +69,7 @@ class ClosedForm:
     def __init__(self, mirror: CalibratedMirror) -> None:
         model = mirror.model
         self._radius, self._limits = model.aperture_radius, mirror.limits
-        x, y = model.sample_x, model.sample_y
+        x, y = model.points.x, model.points.y
         # Columns: the figure with the amplitude 1, the series, the added terms.
         coefficients = np.column_stack([-model.zernike_offset, series_coefficients(), np.eye(len(TERMS))])
         sag = np.column_stack([-model.sag_offset, series_sag(x, y), basis(x, y)])

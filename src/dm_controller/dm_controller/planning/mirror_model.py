@@ -11,6 +11,7 @@ from dm_common import Bools, Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
+from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis, curvature_of_defocus, tilt_influence
 from dm_common.values import check_array
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
@@ -48,9 +49,7 @@ class InfluenceModel:
     aperture_radius: float
     influence_zernike: Floats  # (K, N) m per unit signal
     zernike_offset: Floats  # (K,) m
-    sample_x: Floats  # (P,)
-    sample_y: Floats
-    sample_weight: Floats  # (P,) sums to 1
+    points: SamplePoints
     influence_sag: Floats  # (P, N) m per unit signal
     sag_offset: Floats  # (P,) m
     held_out_rms: float  # m
@@ -59,16 +58,15 @@ class InfluenceModel:
     actuator_y: Floats | None = None
 
     def __post_init__(self) -> None:
-        terms, points, actuators = len(TERMS), len(self.sample_x), self.influence_zernike.shape[1]
+        terms, points, actuators = len(TERMS), len(self.points), self.influence_zernike.shape[1]
         expected = {
             "influence_zernike": (terms, actuators),
             "zernike_offset": (terms,),
-            "sample_x": (points,),
-            "sample_y": (points,),
-            "sample_weight": (points,),
             "influence_sag": (points, actuators),
             "sag_offset": (points,),
         }
+        for axis in ("x", "y", "weight"):
+            check_array(f"calibration: sample_{axis}", getattr(self.points, axis), (points,))
         for name, shape in expected.items():
             check_array(f"calibration: {name}", getattr(self, name), shape)
         if not self.aperture_radius > 0:
@@ -92,7 +90,7 @@ def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
         TargetError: no such surface exists over the aperture.
     """
     radius = model.aperture_radius
-    return Shape(target.coefficients(radius), target.sag(model.sample_x, model.sample_y, radius))
+    return Shape(target.coefficients(radius), target.sag(model.points.x, model.points.y, radius))
 
 
 @dataclass(frozen=True)
@@ -169,8 +167,8 @@ class CalibratedMirror:
         self, model: InfluenceModel, limits: Limits, hold_tilt: bool = True, axis: Sequence[float] = (0.0, 0.0)
     ) -> None:
         self.model, self.limits, self.axis = model, limits, np.array(axis, dtype=float)
-        self._weights = np.sqrt(model.sample_weight)
-        self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
+        self._weights = np.sqrt(model.points.weight)
+        self._terms = np.linalg.qr(self._weights[:, None] * basis(model.points.x, model.points.y))[0]
         self._coefficient_rows = coefficient_rows(model.influence_zernike[PISTON_TILT:])
         bent = reduced(model.influence_sag, self._weights, self._terms[:, :PISTON_TILT])
         self.sag_root: Floats = np.linalg.qr(bent)[1]

@@ -292,7 +292,7 @@ class Planner:
         model, sigma = self.mirror.model, self.hysteresis.unknown_sigma
         miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
         largest = np.abs(miss @ model.influence_zernike[PISTON_TILT:].T).max(axis=1)
-        area = model.sample_weight[:, None] * np.square(model.influence_sag)
+        area = model.points.weight[:, None] * np.square(model.influence_sag)
         rms = sigma * np.linalg.norm(self.mirror.sag_root @ self._whole)
         together = SIGMAS_95 * sigma * self._largest(self._whole), rms
         apart = np.quantile(largest, 0.95), sigma * np.sqrt(area.sum())

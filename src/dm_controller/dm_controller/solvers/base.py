@@ -16,7 +16,6 @@ import numpy as np
 from dm_common import Floats
 from dm_common.limits import SLACK, Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
-from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_common.values import check_array
 from dm_controller.planning.mirror_model import InfluenceModel, target_shape
@@ -40,11 +39,6 @@ class Command:
     overflow: float = 0.0
 
 
-def points_of(model: InfluenceModel) -> SamplePoints:
-    """The sampling points of a model."""
-    return SamplePoints(model.sample_x, model.sample_y, model.sample_weight)
-
-
 def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> Shape:
     """A measured surface; sampling points without data take the sag of the 21 terms.
 
@@ -57,13 +51,13 @@ def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> 
             f"{model.zernike_offset.size} and {model.sag_offset.size}: it was made with another interferometer node or "
             "version, calibrate anew"
         )
-    terms = basis(model.sample_x, model.sample_y) @ coefficients
+    terms = basis(model.points.x, model.points.y) @ coefficients
     return Shape(coefficients, np.where(np.isfinite(sag), sag, terms))
 
 
 def rms_sag(shape: Shape, model: InfluenceModel) -> float:
     """Area-weighted rms sag of a shape, piston and tilt removed, m."""
-    return float(rms(remove_piston_tilt(shape.sag[None, :], points_of(model)), model.sample_weight)[0])
+    return float(rms(remove_piston_tilt(shape.sag[None, :], model.points), model.points.weight)[0])
 
 
 class Solver(ABC):

@@ -11,7 +11,7 @@ from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel, reduced
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Command, Shape, Solver, miss_rows, normalised_terms, points_of
+from dm_controller.solvers.base import Command, Shape, Solver, miss_rows, normalised_terms
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3
@@ -86,7 +86,7 @@ class AZWreg(Solver):
         """`region_weights`: (10,) Eq. (8), from the centre outwards; None = all equal."""
         super().__init__(model, limits)
         weights = np.ones(len(AREA_FRACTIONS)) if region_weights is None else np.asarray(region_weights, dtype=float)
-        points = points_of(model)
+        points = model.points
         self._row = command_row_weights(points, weights)
         plane = self._row[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y])
         self._plane = np.linalg.qr(plane)[0]

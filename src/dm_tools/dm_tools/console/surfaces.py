@@ -98,7 +98,7 @@ class SurfaceModel:
         self.radius = model.aperture_radius
         self.actuators = calibration.actuators
         self._zernike, self._zernike_offset = model.influence_zernike, model.zernike_offset
-        points = np.column_stack([model.sample_x, model.sample_y])
+        points = np.column_stack([model.points.x, model.points.y])
         values = np.column_stack([model.influence_sag, model.sag_offset])
         x, y, self._inside = _disc()
         self._sag = RBFInterpolator(points, values)(np.column_stack([x[self._inside], y[self._inside]]))

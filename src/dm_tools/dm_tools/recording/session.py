@@ -21,7 +21,6 @@ from dm_common.measurement import Measurement
 from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
 from dm_controller.planning.active_calibration import model_of
-from dm_controller.solvers.base import points_of
 from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Message
 from dm_tools.recording.interfaces import message_class
 
@@ -94,7 +93,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     maps = _maps(during)
     moves = [move for time, move in _moves(received["actuator_state"], mirror) if begun <= time < end]
     before = [message for time, message in received["calibration"] if time < begun and message.id]
-    run = RecordedRun(mirror, tuple(moves), maps, first.feedback.plan, _model(before[-1]) if before else None)
+    run = RecordedRun(mirror, tuple(moves), maps, first.feedback.plan, model_of(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", begun)
     stamps = {measured.stamp_ns for measured in maps}  # including maps taken after the run
     known = {message.id for message in before}
@@ -165,12 +164,6 @@ def _maps(messages: dict[str, list[Any]]) -> tuple[Measurement, ...]:
             parts.setdefault(stamp_ns(message.header.stamp), {})[part] = message
     whole = [parts[stamp] for stamp in sorted(parts) if len(parts[stamp]) == 3]
     return tuple(measurement_from(SimpleNamespace(**each)) for each in whole)
-
-
-def _model(calibration: Any) -> Any:
-    """The `LinearModel` from which shapes are solved, from the message of the calibration that was in use."""
-    model = model_of(calibration)
-    return SimpleNamespace(influence_sag=model.influence_sag, sag_offset=model.sag_offset, points=points_of(model))
 
 
 def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], tuple[str, ...]]:
