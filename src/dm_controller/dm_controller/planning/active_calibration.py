@@ -16,7 +16,6 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, mirror_from, recipe_book_from, stamp_ns, taken
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
-from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
@@ -161,6 +160,8 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
 
     Raises ValueError when its arrays do not fit together.
     """
+    from dm_common.optics.sampling import SamplePoints  # not imported at the start
+
     actuators = calibration.actuators
 
     def matrix(name: str, rows: int) -> Floats:

@@ -1,9 +1,12 @@
 """A calibrated mirror: predicts the surface of a command and finds the command of a surface, before anything moves."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +14,12 @@ from dm_common import Bools, Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
-from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis, curvature_of_defocus, tilt_influence
 from dm_common.values import check_array
 from dm_controller.planning.target import FocusTarget, Shape, TargetError
+
+if TYPE_CHECKING:
+    from dm_common.optics.sampling import SamplePoints
 
 #: Weight of a coefficient relative to the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
