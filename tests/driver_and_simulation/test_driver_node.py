@@ -373,6 +373,18 @@ def test_a_signal_ramps_to_the_safe_shape(
     assert "the mirror stands in the safe shape" in node.output
 
 
+def test_the_mirror_is_described_again_when_another_driver_of_this_name_has_ended(driver: Driver) -> None:
+    node = driver.observer.node
+    other = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+    wait_until(lambda: other.get_subscription_count() > 0)
+    other.publish(MirrorInfo(serial="another"))
+    wait_until(lambda: driver.infos[-1].serial == "another")
+    seen = len(driver.states)
+    wait_until(lambda: len(driver.states) > seen + 1, what="reports, with which the driver looks for others")
+    node.destroy_publisher(other)
+    wait_until(lambda: driver.infos[-1].serial != "another", what="the description of the mirror")
+
+
 def test_a_degauss_is_answered_when_the_process_ends(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
     node, driver = start("dm_driver", "pdm_driver", parameters(unit)), Driver(observer, unit)
     driver.wait_active()

@@ -52,6 +52,7 @@ class PdmDriverNode(ManagedNode):
         self._state_lock = threading.Lock()
         self._link_log = LinkLog(time.monotonic())
         self._published_at = 0.0
+        self._info, self._drivers = MirrorInfo(), 1
         # Plain publishers: the state must be seen in every lifecycle state.
         self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.with_lease(qos.STATE))
         self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.with_lease(qos.LATCHED))
@@ -97,9 +98,9 @@ class PdmDriverNode(ManagedNode):
         self._link_log = LinkLog(time.monotonic())
         self._gate.writer.start()
         self._gate.writer.wait_for_link(self._values["electronics.timeout"])
-        self._info_publisher.publish(
-            mirror_info_message(self._values, configuration, self._frame_id, self.get_clock().now().to_msg())
-        )
+        now = self.get_clock().now().to_msg()
+        self._info = mirror_info_message(self._values, configuration, self._frame_id, now)
+        self._info_publisher.publish(self._info)
 
     def _last_shape(self, configuration: DriverConfiguration) -> LastShape:
         """The record of what was last sent to this unit; an empty one if none can be kept."""
@@ -240,6 +241,9 @@ class PdmDriverNode(ManagedNode):
         """Report periodically: a unit that never answers causes no change of state, but is missing all the same."""
         if (writer := self._gate.writer) is not None:
             self._log_link(writer.state())
+            before, self._drivers = self._drivers, self.count_publishers(self._info_publisher.topic_name)
+            if self._drivers < before:  # another driver of this name, started by mistake, may have described its mirror
+                self._info_publisher.publish(self._info)
         self._publish_state()
 
     def _publish_state(self) -> None:
