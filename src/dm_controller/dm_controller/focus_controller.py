@@ -122,7 +122,7 @@ class FocusController:
 
     def unavailable(self, now: Moment) -> Refusal | None:
         """The reason why requests are refused now, whatever they ask for; None = they are not."""
-        return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
+        return self.not_calibrated if self.active is None else now.refusal or self.monitor.refusal(now.steady)
 
     def _news(self, now: Moment, more: bool = False) -> list[Effect]:
         """Publish capabilities if the driver's state changed or if `more`; a changed estimate, rarely during moves."""
@@ -191,8 +191,8 @@ class FocusController:
                 assert active is not None  # else it is refused
                 raise unreachable(move, active, tolerance)
             if not dry_run:
-                if now.simulated and not now.ns:  # creep would take the clock's jump for time at this shape
-                    raise Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
+                if refusal := now.refusal:
+                    raise refusal
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)
                 at_once = degaussed is not None or (move.degauss is None and self.conditioning.run is None)

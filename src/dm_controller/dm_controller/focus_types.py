@@ -9,7 +9,7 @@ from typing import NamedTuple
 from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
@@ -29,6 +29,13 @@ class Moment(NamedTuple):
     time: float
     steady: float
     simulated: bool = False
+
+    @property
+    def refusal(self) -> Refusal | None:
+        """The refusal of commands until a simulator is heard; creep would take the clock's jump for time at a shape."""
+        if self.ns or not self.simulated:
+            return None
+        return Refusal(ErrorCode.TIMEOUT, "use_sim_time is set, but nothing has come on /clock yet")
 
 
 @dataclass(eq=False)

@@ -887,6 +887,8 @@ def test_nothing_moves_before_simulated_time_has_begun(bench: Bench) -> None:
     assert order.refusal is not None and order.refusal.error_code == ErrorCode.TIMEOUT
     assert "/clock" in str(order.refusal) and not any(isinstance(effect, SendCommand) for effect in effects)
     assert bench.controller.request(request, early, dry_run=True)[0].refusal is None
+    told = capabilities_message(bench.controller, None, VALUES, early)
+    assert (told.error_code, told.quality) == (ErrorCode.TIMEOUT, Capabilities.UNCALIBRATED)
 
 
 def test_an_order_that_takes_too_long(bench: Bench) -> None:
