@@ -139,6 +139,20 @@ def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observe
     node.destroy_node()
 
 
+def test_the_transitions_that_a_parameter_needs_are_those_that_can_be_made(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Example, "requires_activation", False)
+    node = Example(context=observer.node.context, parameter_overrides=[RosParameter("count", value=3)])
+    node.autostart()
+    assert "`ros2 lifecycle set /example deactivate`, then `cleanup` first" in node.put("count", 4)
+    node.trigger_deactivate()
+    assert "`ros2 lifecycle set /example cleanup` first" in node.put("count", 4)
+    node.trigger_cleanup()
+    assert node.put("count", 4) == ""
+    node.destroy_node()
+
+
 def test_a_node_that_fails_by_a_defect_says_so_until_it_goes(observer: Observer) -> None:
     node = Example(context=observer.node.context, parameter_overrides=[RosParameter("count", value=9)])
     node.autostart()

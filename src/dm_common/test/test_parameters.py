@@ -161,7 +161,7 @@ def test_setting_an_unknown_parameter_names_the_near_one(observer: Observer) -> 
 def test_a_lifecycle_node_is_put_right_before_it_is_configured(observer: Observer) -> None:
     configured = False
     node = node_with(observer, "lifecycle", count=9)
-    values = declare(node, TABLE, unlocked=lambda: not configured)
+    values = declare(node, TABLE, locked=lambda: "deactivate`, then `cleanup" if configured else "")
     with pytest.raises(ParameterError, match=r"serial is required.*count = 9"):
         values.check()
     assert get_all(node)["count"] == 3
@@ -171,7 +171,8 @@ def test_a_lifecycle_node_is_put_right_before_it_is_configured(observer: Observe
     assert (values["serial"], values["count"]) == ("S1", 4)
     configured = True
     refused = node.set_parameters([RosParameter("serial", value="S2")])[0]
-    assert "not configured" in refused.reason and values["serial"] == "S1"
+    assert "not configured: `ros2 lifecycle set /lifecycle deactivate`, then `cleanup` first" in refused.reason
+    assert values["serial"] == "S1"
     assert node.set_parameters([RosParameter("gain", value=5.0)])[0].successful
     # `ros2 param load` of a dump: what stays as it is may be set.
     dumped = {name: given for name, given in get_all(node).items() if name in values} | {"gain": 6.0}

@@ -90,8 +90,7 @@ class ManagedNode(LifecycleNode):
         self.session = 0
         self.trouble = ""
         self._made: Mapping[str, Any] | None = None  # parameters of the last `configure`
-        self._unlock = "deactivate" if self.requires_activation else "cleanup"
-        self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
+        self._values = declare(self, table, on_change, self._locked, check)
         self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
         for service in self.services:
             if service.srv_name.endswith("/change_state"):
@@ -146,8 +145,10 @@ class ManagedNode(LifecycleNode):
             self._rest()
         send_results(self)
 
-    def _unlocked(self) -> bool:
-        return not (self.active if self.requires_activation else self.configured)
+    def _locked(self) -> str:
+        if self.active:
+            return "deactivate" if self.requires_activation else "deactivate`, then `cleanup"
+        return "cleanup" if self.configured and not self.requires_activation else ""
 
     def autostart(self) -> None:
         """Configure and activate the node unless its parameter `autostart` is false; called when it is served."""

@@ -163,8 +163,7 @@ def declare(
     node: Node,
     table: Sequence[Parameter],
     on_change: Callable[[Mapping[str, Any]], None] | None = None,
-    unlocked: Callable[[], bool] | None = None,
-    unlock: str = "cleanup",
+    locked: Callable[[], str] | None = None,
     check: Callable[[Mapping[str, Any]], None] = lambda changes: None,
 ) -> Values:
     """Declare every parameter of `table` on `node` and return their values by name.
@@ -172,9 +171,9 @@ def declare(
     Every change is checked; accepted changes are entered in the returned values, then passed to `on_change`.
 
     Args:
-        unlocked: for a lifecycle node: whether parameters that are not live may change now. If given, nothing is raised
-            here: the node calls `Values.check` when it is configured, and errors can be corrected before that.
-        unlock: transition after which they may change.
+        locked: for a lifecycle node: the transitions after which parameters that are not live may change; "" = they may
+            now. If given, nothing is raised here: the node calls `Values.check` when it is configured, and errors can
+            be corrected before that.
         check: raises ValueError for changes that contradict what the node has learnt meanwhile.
 
     Raises:
@@ -182,7 +181,7 @@ def declare(
     """
     by_name = {parameter.name: parameter for parameter in table}
     values = _declared(node, by_name)
-    if unlocked is None:
+    if locked is None:
         values.check()
         for parameter in table:
             if not parameter.live:
@@ -202,9 +201,10 @@ def declare(
                     continue
                 value = parameter.check(change.value)
                 # An unchanged value may be set at any time: `ros2 param load` of a dump sets all parameters.
-                if not (parameter.live or unlocked is None or unlocked() or value == values[change.name]):
-                    state = "configured" if unlock == "cleanup" else "active"
-                    command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {unlock}"
+                first = "" if parameter.live or locked is None else locked()
+                if first and value != values[change.name]:
+                    state = "configured" if "cleanup" in first else "active"
+                    command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {first}"
                     raise ParameterError(f"{change.name} changes only while the node is not {state}: `{command}` first")
                 check({change.name: value})
         except ValueError as error:
