@@ -402,6 +402,15 @@ def test_a_suite_that_is_started_twice_is_named(tmp_path: Path, monkeypatch: pyt
             pass
 
 
+@pytest.mark.parametrize("verb", ["status", "security"])
+def test_without_a_standard_output_it_does_its_work_all_the_same(verb: str, tmp_path: Path) -> None:
+    """As started by a program that has closed its own."""
+    words = {"status": ["--help"], "security": ["--out", str(tmp_path), "--json", "-"]}[verb]
+    command = [sys.executable, "-m", "dm_tools", verb, *words]
+    done = subprocess.run(["bash", "-c", '"$@" >&-', "bash", *command], stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+
+
 @pytest.mark.slow
 def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     """As `./dm` starts it: the signal waits until the command can answer it."""

@@ -91,6 +91,7 @@ PATHS = [
         ("pdm_driver", "electronics.kind", "edac41", "electronics.kind = 'edac41': must be one of edac40_tcp"),
         ("interferometer", "trigger_command", "run", "trigger_command = 'run': must be a str"),
         ("calibration", "settle_time", True, "settle_time = True: must be float"),
+        ("calibration", "use_sim_time", "yes", "use_sim_time = 'yes': must be a bool"),
         *(
             (node, name, NOBODY, f"{name} = '{NOBODY}': must be a path; there is no home folder")
             for node, name in PATHS
@@ -550,6 +551,20 @@ def test_the_command_tells_everything_and_fails_for_what_is_wrong(tmp_path: Path
     findings = json.loads(figures.read_text())["doctor"]
     assert findings["packages"] is None
     assert Finding(**findings[f"watched folder {tmp_path / 'missing'}"]).problem.endswith("does not exist")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("ROS_DOMAIN_ID", "233"), ("ROS_DOMAIN_ID", "x"), ("ROS_LOG_DIR", "/dev/null/x")]
+)
+def test_where_no_node_can_be_made_the_rest_is_checked_all_the_same(name: str, value: str, domain: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "dm_tools", "doctor"],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain), name: value},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1 and "WRONG" in done.stdout and "clock" in done.stdout, done.stdout + done.stderr
 
 
 def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:

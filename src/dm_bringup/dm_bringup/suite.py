@@ -38,7 +38,7 @@ def load_config(path: Path, namespace: str = "") -> Config:
         content = read_yaml(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, KeyError) as error:  # the latter two from tags such as !!int and !!bool
         raise ConfigError(f"{path}: not a YAML file in UTF-8: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")

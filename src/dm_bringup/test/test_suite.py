@@ -70,10 +70,14 @@ def test_values_that_ros_does_not_read_are_named(tmp_path: Path, value: str, sai
         load_config(file)
 
 
-@pytest.mark.parametrize("text", ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "'7e-3'", "e5", "7e", "2024-01-05"])
+NUMBERS = ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "0815", "017", "0x1f", "-.inf"]
+TEXTS = ["'7e-3'", "e5", "7e", "2024-01-05", "10:30", "2024_05", "0b11", "0x_"]
+
+
+@pytest.mark.parametrize("text", NUMBERS + TEXTS)
 def test_numbers_are_what_ros_takes_for_one(tmp_path: Path, text: str) -> None:
     file = tmp_path / "config.yaml"
-    file.write_text(f"/**/pdm_driver: {{ros__parameters: {{mirror.pitch: {text}}}}}\n")
+    file.write_text(f"/**/pdm_driver:\n  ros__parameters:\n    mirror.pitch: {text}\n")
     context = Context()
     context.init(["--ros-args", "--params-file", str(file)])
     try:
@@ -82,6 +86,16 @@ def test_numbers_are_what_ros_takes_for_one(tmp_path: Path, text: str) -> None:
         node.destroy_node()
     finally:
         context.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [("&here [*here]", r"ROS reads no alias \(\*here\)"), ("!!bool x", "'x'"), ("!!int x", "'x'")]
+)
+def test_what_yaml_allows_and_ros_does_not_is_refused(tmp_path: Path, value: str, said: str) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(f"/**/pdm_driver: {{ros__parameters: {{safe_signals: {value}}}}}\n")
+    with pytest.raises(ConfigError, match=rf"config\.yaml: not a YAML file in UTF-8: .*{said}"):
+        load_config(file)
 
 
 def test_a_section_of_all_nodes_counts_for_each_that_runs(tmp_path: Path) -> None:

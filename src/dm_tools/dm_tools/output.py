@@ -30,7 +30,7 @@ class _Screen(Console):
 
 
 #: Lines are not wrapped here: a terminal does that itself, and files and pipes need them whole.
-console = _Screen(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120, soft_wrap=True)
+console = _Screen(highlight=False, emoji=False, width=None if os.isatty(1) else 120, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 
 #: The value of `--json` for standard output.
@@ -151,7 +151,7 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
         return
     text = json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n"
     if path == STANDARD_OUTPUT:
-        sys.stdout.write(text)
+        print(text, end="")
         return
     write_whole(path, text.encode())
     console.print(f"figures: {path}")

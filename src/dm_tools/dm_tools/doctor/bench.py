@@ -16,13 +16,14 @@ from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
 from dm_common.state_files import ros_home
+from dm_common.values import switch
 from dm_tools.doctor.electronics import electronics_checks
 from dm_tools.doctor.machine import Check, Finding, disk
 
 UNSET = "CHANGE"
 DAY_S = 86400.0
-#: Parameters that every node has.
-COMMON = ("use_sim_time",)
+#: Parameter that ROS gives every node.
+COMMON = Parameter("use_sim_time", switch(False), "Take the time from /clock.")
 #: Ports that the virtual bench opens, by their parameters, and their protocols.
 BENCH_PORTS = {
     "electronics.tcp_port": "TCP",
@@ -74,7 +75,7 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
 @cache
 def _known(name: str) -> dict[str, Parameter]:
     """The parameters of a node, by their names."""
-    return {item.name: item for node in NODES if node.name == name for item in node.load_parameters()}
+    return {item.name: item for node in NODES if node.name == name for item in (*node.load_parameters(), COMMON)}
 
 
 def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,7 +113,7 @@ def _problems(node: str, values: Mapping[str, Any]) -> dict[str, str]:
                 known[name].check(value)
             except ParameterError as error:
                 found[name] = str(error)
-        elif name not in (*known, *COMMON):
+        elif name not in known:
             found[name] = str(unknown_name("parameter", name, known))
     return found
 

@@ -32,7 +32,7 @@ def doctor(
     for name, run in checks:
         try:
             found = run()
-        except OSError as error:  # such as a folder in one that this user may not search
+        except (OSError, RuntimeError) as error:  # a folder in one that this user may not search; of ROS: no home
             found = Finding(f"cannot be checked: {error}", "give this user the right to it, or choose another place")
         findings[name] = finding = held_by_the_nodes(name, found, findings.get("nodes that are running"))
         if finding is None or not finding.cure:
