@@ -241,7 +241,8 @@ class MapListener:
         wholes([], 1, actuators, sizes=range(actuators)).check("without", request.without)
         with self._turn:
             timeout = self._values["driver_timeout"]
-            self._services.hold.wait_for(lambda: not self._busy(), request, "a calibration is running", timeout)
+            busy = "a calibration is running: cancel the action calibrate to end it, or set take_over"
+            self._services.hold.wait_for(lambda: not self._busy(), request, busy, timeout)
             with ExitStack() as stack:
                 purpose = "a map is compared with the calibration (service update_calibration)"
                 try:
