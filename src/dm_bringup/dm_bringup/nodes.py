@@ -85,13 +85,14 @@ HELD_SIGNALS = "env --block-signal=INT --block-signal=TERM"
 OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"
 #: Value of the launch argument `autostart`: nodes are configured and activated from outside.
 BY_EVENTS = "events"
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 #: Arguments of the launch files: name, default (None = `config` must be given) and description.
 LAUNCH_ARGUMENTS = (
     ("config", None, "parameter file of all nodes, see config/hardware.yaml"),
     ("namespace", "", "namespace; one per mirror"),
     ("respawn", "true", "start a node that died again"),
     ("respawn_delay", "2.0", "s before that"),
-    ("log_level", "info", "of every node: debug, info, warn, error, fatal"),
+    ("log_level", "info", f"of every node: {', '.join(LOG_LEVELS)}"),
     ("remap", "", "remappings of every node, separated by blanks: image_raw:=/camera/image_raw"),
     ("use_sim_time", "", "true or false; empty = as the parameter file says"),
     (
@@ -115,6 +116,8 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
     Raises:
         ValueError: an invalid value; the message names the argument, the value and what is allowed.
     """
+    if (level := values["log_level"].rpartition(":=")[2].lower()) not in LOG_LEVELS:  # may be that of one logger
+        raise ValueError(f"log_level = {level!r}: must be {', '.join(LOG_LEVELS)}")
     switches = {}
     if values["use_sim_time"]:
         switches["use_sim_time"] = flag("use_sim_time", values["use_sim_time"])
