@@ -413,6 +413,7 @@ def test_a_request_just_after_the_start_waits_for_the_calibration_that_is_on_its
     fresh.use(None, None)
     refusal = fresh.unavailable(bench.now)
     assert refusal is not None and "arrives within seconds of this node's start" in str(refusal)
+    assert "no mirror_info from pdm_driver yet: is it running?" in str(refusal)
     early = Moment(0, 0.0, bench.time, simulated=True)
     asked = iter([(fresh, bench.now), (fresh, bench.now), (bench.controller, early), (bench.controller, bench.now)])
     host = cast(Any, SimpleNamespace(_started=time.monotonic(), controller=lambda: nullcontext(next(asked))))

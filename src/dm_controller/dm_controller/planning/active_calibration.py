@@ -22,6 +22,7 @@ from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
+NO_DRIVER = "no mirror_info from pdm_driver yet"
 #: Addition to the refusal while no calibration has been heard of, as in the first moments of the node.
 NOT_YET = "if one is in use, it arrives within seconds of this node's start"
 #: Warning where `hold_tilt` is true but the tilt cannot be held.
@@ -121,11 +122,9 @@ def active_calibration(
     """
     if calibration is None or not calibration.id:
         text = NO_CALIBRATION if calibration is not None else f"{NO_CALIBRATION}; {NOT_YET}"
-        raise Refusal(ErrorCode.NOT_CALIBRATED, text)
+        raise Refusal(ErrorCode.NOT_CALIBRATED, text if mirror is not None else f"{text}; {NO_DRIVER}: is it running?")
     if mirror is None:
-        raise Refusal(
-            ErrorCode.DRIVER_UNAVAILABLE, "the mirror's limits are unknown: no mirror_info from pdm_driver yet"
-        )
+        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"the mirror's limits are unknown: {NO_DRIVER}")
     try:
         described = mirror_from(mirror)
         wrong = mismatch(
