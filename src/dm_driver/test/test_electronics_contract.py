@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import sys
@@ -17,6 +18,7 @@ import pytest
 
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.base import CodeError, DriveElectronics, ElectronicsSettings, LinkError, NotOpenError
+from dm_driver.electronics.edac40 import Edac40Tcp
 from drive_unit_servers import UNITS, DriveUnit, Edac40TcpUnit, Edac40UdpUnit
 from waiting import wait_until
 
@@ -237,6 +239,30 @@ def test_tcp_notices_between_writes_that_the_unit_closed() -> None:
         electronics.write(codes, wired)
         wait_until(lambda: len(unit.frames) == 2)
         electronics.close()
+
+
+def test_another_service_that_sends_without_end_holds_nobody_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        electronics = Edac40Tcp(ElectronicsSettings("127.0.0.1", listener.getsockname()[1]))
+        electronics.open()
+        service, _ = listener.accept()
+
+        def send() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    service.sendall(bytes(65536))
+
+        endless, check = (threading.Thread(target=work, daemon=True) for work in (send, electronics.check))
+        endless.start()
+        check.start()
+        check.join(5.0)
+        returned = not check.is_alive()
+        service.shutdown(socket.SHUT_RDWR)  # which ends both
+        endless.join(5.0)
+        check.join(5.0)
+        service.close()
+        electronics.close()
+    assert returned
 
 
 @pytest.mark.slow

@@ -143,9 +143,10 @@ class Edac40Tcp(_Edac40):
         return int(struct.unpack("i", answer)[0])
 
     def _do_check(self) -> None:
-        # The unit never sends: a readable link has ended (read raises), or holds a stray byte (dropped).
-        while self._link.in_waiting:
-            self._link.read(1)
+        # The unit never sends: a readable link has ended (read raises), or holds stray bytes (dropped). Only once:
+        # another service, at a wrong address, may send without end.
+        if self._link.in_waiting:
+            self._link.read(4096)
 
 
 class Edac40Udp(_Edac40):
