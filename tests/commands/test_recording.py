@@ -286,8 +286,10 @@ def test_definitions_hold_every_type_they_use() -> None:
 
 def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", [("/actuator_state", ActuatorState())])
-    with pytest.raises(FileExistsError, match="never overwritten"):
-        BagWriter(tmp_path / "bag")
+    (tmp_path / "link").symlink_to("nowhere")
+    for name in ("bag", "link"):
+        with pytest.raises(FileExistsError, match="never overwritten"):
+            BagWriter(tmp_path / name)
 
 
 def flipped(content: bytes, at: int) -> bytes:

@@ -16,7 +16,7 @@ from typing import Any
 try:
     from backports import zstd
     from rosbags import interfaces
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer, WriterError
     from rosbags.rosbag2.storage_mcap import McapReader, McapWriter
 except ModuleNotFoundError as error:  # rosdep has no key for it
     raise RuntimeError("recordings need rosbags: `pip install rosbags`, see docs/install.md") from error
@@ -73,12 +73,13 @@ class BagWriter:
             FileExistsError: there is something already.
             OSError: it cannot be written to.
         """
-        if folder.exists():
-            raise FileExistsError(f"{folder}: exists already; a recording is never overwritten")
         self.folder = folder
-        self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        self._writer.open()
+        try:
+            self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
+        except WriterError as error:
+            raise FileExistsError(f"{folder}: exists already; a recording is never overwritten") from error
         assert isinstance(self._writer.storage, McapWriter)
         self._storage = self._writer.storage
         self._storage.compressor = partial(zstd.compress, options=CHECKED)
