@@ -417,6 +417,20 @@ def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer)
     assert found.error_code == ErrorCode.TIMEOUT and "their header.stamp is 0" in found.message
 
 
+def test_a_clock_of_the_camera_that_is_little_ahead_is_named(scene: FilmedScene, observer: Observer) -> None:
+    """Also where the newest image is no longer ahead when the wait for it ends."""
+    publish = scene._publish_image
+
+    def publish_ahead(pixels: np.ndarray, exposed: Any) -> None:
+        sec, nanosec = divmod(10**9 * exposed.sec + exposed.nanosec + 60_000_000, 10**9)
+        publish(pixels, Time(sec=sec, nanosec=nanosec))
+        time.sleep(0.1)
+
+    scene._publish_image = publish_ahead  # type: ignore[method-assign]
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.TIMEOUT and "s ahead of this node's clock" in found.message, found.message
+
+
 @pytest.mark.parametrize(
     ("rate", "code", "text"),
     [

@@ -82,6 +82,7 @@ class FocusProbe:
         self._other_request: float | None = None  # curvature requested by another node while held [1/m]
         self._degauss_s = 0.0  # duration of a degauss that the latest move waits for
         self._measuring, self._apart = False, 0.0  # _apart: time between the stamps of the latest two images [s]
+        self._arrived = math.inf  # when the latest came [s]
         self._fresh: Image | CompressedImage | None = None
         self._now = lambda: seconds(node.get_clock().now().to_msg())
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
@@ -110,9 +111,9 @@ class FocusProbe:
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         with self._changed:
-            before, self.newest = self.newest, message
+            before, self.newest, self._arrived = self.newest, message, self._now()
             self._apart = seconds(message.header.stamp) - seconds(before.header.stamp) if before is not None else 0.0
-            if not (self._measuring and self._gate.open_for(seconds(message.header.stamp), self._now())):
+            if not (self._measuring and self._gate.open_for(seconds(message.header.stamp), self._arrived)):
                 self.dropped += 1
                 return
             self.dropped += self._fresh is not None
@@ -235,7 +236,7 @@ class FocusProbe:
                     message, self._fresh = self._fresh, None
                 if message is None:
                     newest = None if self.newest is None or self.newest is before else seconds(self.newest.header.stamp)
-                    reason = self._gate.reason(newest, self._apart, limit, self._now())
+                    reason = self._gate.reason(newest, self._apart, limit, self._arrived)
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
                     raise Refusal(ErrorCode.TIMEOUT, text + unusable)
                 try:

@@ -158,9 +158,9 @@ def grey(message: Any) -> NDArray:
 
 
 def exposure_fault(image: NDArray) -> str:
-    """Fault in the exposure of grey levels (H, W): black, or many pixels at the largest value; "" = none."""
-    top = image.max()
-    if top <= 0:
+    """Fault in the exposure of grey levels (H, W): black or NaN, or many at the largest value; "" = none."""
+    top = np.fmax.reduce(image, axis=None)  # leaves NaN out
+    if not top > 0:
         return "the image is black"
     share = float(np.mean(image == top))
     if share < CLIPPED:
@@ -217,7 +217,7 @@ class SettledGate:
             newest: stamp of the latest image that came meanwhile; None = none did.
             apart: time between it and the one before [s]; 0 = not known.
             timeout_s: how long was waited for an image.
-            now: present time.
+            now: when it came.
         """
         if newest is not None and newest - self._stamp_lead > now + self._ahead:
             ahead = newest - self._stamp_lead - now
@@ -228,7 +228,7 @@ class SettledGate:
             return "none came; is the camera running?"
         if newest == 0:
             return "their header.stamp is 0, so their focus is not known; it must be above 0"
-        if not self.open_for(newest, now):
+        if not self.open_for(newest):
             early = self.settled_at + self._stamp_lead - newest
             why = "does the camera still run, do the clocks agree?"
             return f"the newest was exposed {early:.3f} s before the shape was reached; {why}"

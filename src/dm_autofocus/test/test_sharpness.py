@@ -191,7 +191,8 @@ def test_an_unknown_encoding_is_named(encoding: str) -> None:
 
 def test_wrong_exposures_are_named() -> None:
     clipped = np.minimum(2 * texture(), 255).astype("u1")
-    assert exposure_fault(np.zeros((4, 4), "u1")) == "the image is black"
+    assert exposure_fault(np.zeros((4, 4), "u1")) == exposure_fault(np.full((4, 4), np.nan)) == "the image is black"
+    assert "have the largest value, 1" in exposure_fault(np.array([[np.nan, 1.0, 1.0, 0.0]]))
     assert "have the largest value, 255" in exposure_fault(clipped + (255 - clipped) * (clipped > 180))
     assert exposure_fault(texture().astype("u1")) == exposure_fault(texture().astype("f4")) == ""
 
