@@ -75,7 +75,7 @@ def unfit() -> Iterator[Calibration]:
 
 #: What is wrong with each of them, as the node says it.
 UNFIT = {
-    "pokes": (ErrorCode.TOO_FEW_MAPS, "calibrate with the plan FULL"),
+    "pokes": (ErrorCode.TOO_FEW_MAPS, "calibrate with the plan full"),
     "few": (ErrorCode.TOO_FEW_MAPS, "9 samples: a constant, one variable and 10 degrees of freedom"),
     "levels": (ErrorCode.TOO_FEW_MAPS, "candidates s02 and s03 are proportional over all samples"),
     "holed": (ErrorCode.MAP_INSUFFICIENT, "p44: the concentric region of 10% of the area holds no valid data"),

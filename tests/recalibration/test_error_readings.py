@@ -94,7 +94,7 @@ def test_bad_input_is_refused_in_words() -> None:
         regress_surface_errors(maps, fit, test_set=("p60",))
     with pytest.raises(UnknownNameError, match="test surface 'pz01'"):
         regress_surface_errors(maps, fit, test_set=("pz01",))
-    with pytest.raises(TooFewMapsError, match="calibrate with the plan FULL"):
+    with pytest.raises(TooFewMapsError, match="calibrate with the plan full"):
         regress_surface_errors(*calibrated_by_pokes())
     few = np.array([not (label.startswith("p") and label[1:].isdigit() and int(label[1:]) > 9) for label in maps.label])
     kept = maps.select(few)

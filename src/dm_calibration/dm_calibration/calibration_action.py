@@ -86,7 +86,7 @@ class CalibrateAction:
         """Make the plan of the goal, and the options that define it."""
         goal = self._goal
         if goal.until and goal.plan != PlanKind.HYSTERESIS:
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan hysteresis ends early")
         default = LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]
         self._options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],

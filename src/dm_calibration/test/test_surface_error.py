@@ -44,7 +44,7 @@ def test_weights_of_surfaces_follow_eq_8() -> None:
 
 @pytest.mark.slow
 def test_what_cannot_be_regressed_is_refused() -> None:
-    with pytest.raises(TooFewMapsError, match="calibrate with the plan FULL"):
+    with pytest.raises(TooFewMapsError, match="calibrate with the plan full"):
         fit_predictor(*calibrated_by_pokes())
     maps, _ = calibrated()
     few = np.array([not (label.startswith("p") and label[1:].isdigit() and int(label[1:]) > 9) for label in maps.label])

@@ -83,7 +83,7 @@ def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
     """
     rows = np.array([k for k, label in enumerate(maps.label) if label in SURFACES and fit.used[k]], dtype=np.int64)
     if not rows.size:
-        raise TooFewMapsError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
+        raise TooFewMapsError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan full")
     labels = tuple(maps.label[row] for row in rows)
     error = surface_control_error(maps.sag[rows], maps.applied[rows], fit.influence_zernike, maps.points)
     return SurfaceErrors(rows, labels, maps.applied[rows], regional_rms(error, maps.points, labels=labels))
