@@ -9,7 +9,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -170,16 +169,13 @@ class DriveElectronics(ABC):
 
     def close(self) -> None:
         """Close the link; outputs keep their values. Closing a closed link does nothing."""
-        if self._open:
-            self._abandon()
+        self._abandon()
 
     def __enter__(self) -> Self:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def _check_codes(self, codes: NDArray[np.uint16], wired: Bools) -> None:

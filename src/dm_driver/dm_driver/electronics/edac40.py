@@ -145,8 +145,7 @@ class Edac40Tcp(_Edac40):
     def _do_check(self) -> None:
         # The unit never sends: a readable link has ended (read raises), or holds stray bytes (dropped). Only once:
         # another service, at a wrong address, may send without end.
-        if self._link.in_waiting:
-            self._link.read(4096)
+        self._link.read(4096)
 
 
 class Edac40Udp(_Edac40):

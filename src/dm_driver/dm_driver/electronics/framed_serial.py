@@ -54,9 +54,7 @@ class FramedSerial(DriveElectronics):
         self._send(bytes.fromhex(self._frame.opening))
 
     def _do_write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
-        pause = self._sent_at + 1.0 / self.frames_per_second - time.monotonic()
-        if pause > 0.0:
-            time.sleep(pause)
+        time.sleep(max(0.0, self._sent_at + 1.0 / self.frames_per_second - time.monotonic()))
         if self._reply:
             self._do_check()  # a late answer is not the answer to this frame
         self._send(self._frame.encode(codes))
@@ -71,6 +69,4 @@ class FramedSerial(DriveElectronics):
 
     def _do_check(self) -> None:
         """Empty the system's buffer; fails on a device that has been unplugged."""
-        waiting = self._link.in_waiting
-        if waiting:
-            self._link.read(waiting)
+        self._link.read(self._link.in_waiting)
