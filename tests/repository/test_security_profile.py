@@ -111,7 +111,8 @@ def signed(folder: Path, profile: Profile, enclave: str) -> Path:
     """Permissions as sros2 writes them, a key, and the texts alone in place of what is signed."""
     place = folder / "enclaves" / profile.path(enclave).lstrip("/")
     place.mkdir(parents=True)
-    grant = "<validity><not_after>2099-01-01T00:00:00</not_after></validity><allow_rule>"
+    dates = "<not_before>2024-01-01T00:00:00</not_before><not_after>2099-01-01T00:00:00</not_after>"
+    grant = f"<validity>{dates}</validity><allow_rule>"
     grant += f"<domains><id>{profile.domain}</id></domains>"
     for rule, topics in dds_topics(profile, enclave).items():
         listed = "".join(f"<topic>{topic}</topic>" for topic in sorted(topics))
@@ -146,6 +147,7 @@ def test_a_keystore_that_keeps_to_the_profile(tmp_path: Path) -> None:
         ("permissions.xml", "rt/actuator_state", "rt/actuator_command", "publish: missing: rt/actuator_state"),
         ("permissions.xml", "DENY", "ALLOW", "the default must be DENY"),
         ("permissions.xml", "2099", "2019", "not valid any more since 2019-01-01"),
+        ("permissions.xml", "2024", "2098", "not valid before 2098-01-01"),
         ("permissions.p7s", "rt/mirror_info", "rt/others", "holds other permissions"),
         ("permissions.xml", "<id>0<", "<id>7<", "for the ROS domain 7: must be 0"),
         ("governance.p7s", "<id>0<", "<id>7<", "enclaves/governance.p7s: holds another governance than governance.xml"),

@@ -89,10 +89,11 @@ def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
         for text, names in (("more than the policy", allowed - wanted), ("missing", wanted - allowed)):
             if names:
                 found.append(f"{path}: {rule}: {text}: {', '.join(sorted(names)[:5])}")
-    for item in document.iter("not_after"):
-        end = datetime.fromisoformat(str(item.text))
-        if (end if end.tzinfo else end.replace(tzinfo=UTC)) < datetime.now(UTC):
-            found.append(f"{path}: not valid any more since {item.text}")
+    said = {"not_before": "not valid before", "not_after": "not valid any more since"}
+    for item in (each for each in document.iter() if each.tag in said):
+        date = datetime.fromisoformat(str(item.text))
+        if ((date if date.tzinfo else date.replace(tzinfo=UTC)) < datetime.now(UTC)) is (item.tag == "not_after"):
+            found.append(f"{path}: {said[item.tag]} {item.text}")
     return found
 
 
