@@ -21,12 +21,16 @@ def edited(text: str, changes: Changes, namespace: str = "") -> str:
             lost by an edit.
     """
     expected, namespace = _sections(text), namespace.strip("/")
-    for node, values in changes.items():
-        key = _key(expected, node, namespace)
-        expected[key] = expected.get(key, {}) | dict(values)
-        for name, value in reversed(list(values.items())):  # each new one is inserted before the existing ones
-            text = _with_value(text, key, name, value)
-    if _sections(text) != expected:
+    try:
+        for node, values in changes.items():
+            key = _key(expected, node, namespace)
+            expected[key] = expected.get(key, {}) | dict(values)
+            for name, value in reversed(list(values.items())):  # each new one is inserted before the existing ones
+                text = _with_value(text, key, name, value)
+        kept = _sections(text) == expected
+    except (yaml.YAMLError, ConfigError):  # nothing may be added after its end
+        kept = False
+    if not kept:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
     for node, values in changes.items():
         if not values.items() <= values_in(expected, node, namespace).items():

@@ -134,6 +134,12 @@ def test_what_is_no_parameter_file_is_refused() -> None:
             edited(text, CHANGES)
 
 
+@pytest.mark.parametrize("text", ["/**/pdm_driver: {ros__parameters: {}}\n...\n", '{"a/b": {"ros__parameters": {}}}'])
+def test_a_file_to_which_nothing_can_be_added_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"put in by hand: .*orientation\.flip_x"):
+        edited(text, CHANGES)
+
+
 def test_a_value_that_stands_in_a_group_is_never_overruled_by_it() -> None:
     text = "pdm_driver:\n  ros__parameters:\n    mirror:\n      wiring: trihex\n"
     assert values_of(text) == {"pdm_driver": {"mirror.wiring": "trihex"}}
