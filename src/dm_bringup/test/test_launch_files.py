@@ -100,13 +100,15 @@ def test_launch_files_start_what_up_starts(
             start_nodes(DEFAULTS | {"config": str(wrong)})
 
 
-def test_a_signal_waits_until_a_node_has_imported_what_it_needs(domain: int) -> None:
+@pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGINT, signal.SIGTERM)])
+def test_signals_wait_until_a_node_has_imported_what_it_needs(domain: int, signals: tuple[int, ...]) -> None:
     script = "print('begun', flush=True); input(); from dm_common.ros.executor import run_node; run_node(lambda: 1 / 0)"
     command = [*HELD_SIGNALS.split(), sys.executable, "-c", script]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "begun\n"
-        process.send_signal(signal.SIGINT)
+        for number in signals:  # `ros2 launch` sends the second one after 5 s
+            process.send_signal(number)
         assert process.communicate("\n", timeout=60.0)[1] == "" and process.returncode == 0
 
 

@@ -50,8 +50,6 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKE_PERIOD_S = 1.0
 #: An answer that took this long to send was dropped, s; others take less than a millisecond.
 DROPPED_S = 0.09
-#: When a node ends: longest wait for the ends of its goals, and time to send their results, s.
-GOALS_END_S, RESULTS_S = 1.0, 0.1
 #: Pauses before each further try to send a dropped answer, s. Each try blocks the process for a tenth of a second, and
 #: the client may never be discovered.
 PAUSES_S = (0.3, 1.0, 3.0)
@@ -172,14 +170,11 @@ def destroy(node: Node) -> None:
     node.destroy_node()
 
 
-def send_results(node: Node) -> None:
-    """Serve a node that ends until its goals, which were made to end, have done so and their clients know."""
-    servers = [each for each in node.waitables if isinstance(each, ResendingActionServer) and each.unfinished]
-    end = time.monotonic() + GOALS_END_S
-    while node.executor is not None and servers and time.monotonic() < end:
-        node.executor.spin_once(timeout_sec=0.02)
-        if not any(each.unfinished for each in servers):
-            end = min(end, time.monotonic() + RESULTS_S)
+def _interrupt(*_: object) -> None:
+    """Raise KeyboardInterrupt, only once: `ros2 launch` may have sent both signals before they were unblocked."""
+    for number in STOPPING:
+        signal.signal(number, lambda *_: None)
+    raise KeyboardInterrupt
 
 
 def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
@@ -194,7 +189,7 @@ def run_node(make_node: Callable[[], Node], images: bool = False) -> int:
     """
     # Until `StopOnSignals`, both raise KeyboardInterrupt; a background job of a shell would otherwise ignore SIGINT.
     for number in STOPPING:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, _interrupt)
     node: Node | None = None
     executor: Executor | None = None
     try:

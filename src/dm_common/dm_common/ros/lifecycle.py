@@ -1,5 +1,6 @@
 """Lifecycle nodes, and the health of a node on `/diagnostics` (the Python diagnostic_updater is not on PyPI)."""
 
+import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.executor import send_results
+from dm_common.ros.executor import ResendingActionServer
 from dm_common.ros.parameters import Parameter, declare
 
 OK = DiagnosticStatus.OK
@@ -19,6 +20,8 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 #: How often health is published, s.
 PERIOD_S = 1.0
+#: When a node ends: longest wait for the ends of its goals, and time to send their results, s.
+GOALS_END_S, RESULTS_S = 1.0, 0.1
 
 
 @dataclass
@@ -143,7 +146,12 @@ class ManagedNode(LifecycleNode):
         """At the end of the process: goals end as when the node is deactivated, and their clients are told."""
         if self.requires_activation:
             self._rest()
-        send_results(self)
+        servers = [each for each in self.waitables if isinstance(each, ResendingActionServer) and each.unfinished]
+        end = time.monotonic() + GOALS_END_S
+        while self.executor is not None and servers and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+            if not any(each.unfinished for each in servers):
+                end = min(end, time.monotonic() + RESULTS_S)
 
     def _locked(self) -> str:
         if self.active:
