@@ -266,6 +266,9 @@ def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
     config.write_text(f"/left{section}4}}}}\n/right{section}3}}}}\n")
     figures = _recalibrated(BagReader(tmp_path / "theirs"), 0, "/left", None, config)
     assert figures["identical"] is True
+    config.write_text("/calibration: {ros__parameters: {poke_amplitud: 0.4}}\n")
+    with pytest.raises(ValueError, match=r"bench\.yaml: calibration: parameter 'poke_amplitud' is unknown"):
+        _recalibrated(BagReader(tmp_path / "theirs"), 0, "/left", None, config)
 
 
 def test_a_recording_without_a_run_is_told(tmp_path: Path) -> None:

@@ -71,11 +71,15 @@ def replay(
 def _recalibrated(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
     """Make the calibration again; returns its figures."""
     from dm_calibration.store.calibration_store import CalibrationStore
+    from dm_tools.doctor.bench import parameters
     from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
 
     session = read_session(bag, run, namespace)
     if config is not None:
-        session.parameters.update(load_config(config, namespace.strip("/")).get("calibration", {}))
+        given = load_config(config, namespace.strip("/")).get("calibration", {})
+        if wrong := parameters({"calibration": given}):
+            raise ValueError(f"{config}: {wrong.problem}")
+        session.parameters.update(given)
     now, mirror = time.time_ns(), session.run.mirror
     folder = CalibrationStore(store if store is not None else Path("runs/replayed"))
     calibration = recalibrate(session, folder.new_id(mirror.name, mirror.serial, now), now)
