@@ -39,7 +39,7 @@ from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.replay import replay
 from dm_tools.verbs.report import folder_with
-from dm_tools.verbs.up import first_command, lacks, only_suite
+from dm_tools.verbs.up import first_command, lacks, only_suite, shared_config
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -375,6 +375,29 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
 def test_maps_that_a_demo_cannot_take_are_refused_before_it_begins(words: tuple[str, ...]) -> None:
     refused = CliRunner().invoke(cli.make_app(), ["demo", *words])
     assert refused.exit_code == 2 and "--hysteresis-maps" in refused.output
+
+
+def test_a_demo_of_a_file_without_a_settle_time_takes_the_nodes_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has calibrated for minutes when it needs it."""
+    from dm_tools.demo import demo
+
+    file, waited = tmp_path / "bench.yaml", []
+    lines = shared_config("bench.yaml").read_text().splitlines()
+    file.write_text("\n".join(line for line in lines if "settle_time" not in line))
+
+    def sweep(_client: Any, settle: float) -> Any:
+        waited.append(settle)
+        raise RuntimeError("the rest is not tried")
+
+    made = SimpleNamespace(id="", duration=0.0, capabilities=SimpleNamespace(message=""), mirror_info=None)
+    monkeypatch.setattr(demo, "running_bench", lambda *_: nullcontext(made))
+    monkeypatch.setattr(demo, "sweep", sweep)
+    for name in ("run_calibration", "show_result", "wait_for_calibration"):
+        monkeypatch.setattr(demo, name, lambda *_: made)
+    done = CliRunner().invoke(cli.make_app(), ["demo", "--config", str(file), "--out", str(tmp_path / "out")])
+    assert waited == [0.5], done.exception
 
 
 def test_its_nodes_run_as_those_of_launch_files(monkeypatch: pytest.MonkeyPatch) -> None:

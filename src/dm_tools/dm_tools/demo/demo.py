@@ -4,6 +4,7 @@ import os
 import shutil
 import time
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -176,6 +177,7 @@ def demo(
     from dm_client import DeformableMirrorClient
     from dm_common.ros.domains import own_domain
     from dm_tools.demo.figures import save_sweep_figure
+    from dm_tools.doctor.bench import effective
 
     started = time.monotonic()
     folder = usable_folder(out)
@@ -201,7 +203,7 @@ def demo(
             wait_for_calibration(client, result.id)
             console.print(f"reachable: {client.capabilities.message}")
             mirror = client.mirror_info
-            settle = float(config["calibration"]["settle_time"])
+            settle = effective("calibration", config["calibration"])["settle_time"]
             rows, without_hysteresis = sweep(client, settle), []
             ends = rows[0]["curvature"], rows[-1]["curvature"]
             fitting_limit = best_possible(client.latest("calibration"), mirror, ends)
@@ -230,5 +232,5 @@ def demo(
     }
     write_json(json, figures)
     console.print(f"done in {time.monotonic() - started:.0f} s")
-    option = f" --config {config_file}" if config_file else ""
+    option = f" --config {quote(str(config_file))}" if config_file else ""
     next_step(f"./dm up{option} starts such nodes for you to play with; ./dm demo --camera focuses a camera")
