@@ -63,7 +63,7 @@ STAMP_AHEAD, STAMP_AHEAD_SIMULATED = 0.05, 0.5
 
 #: Encodings by the modes to which Pillow decodes images, "I" for 16 bits before its version 10.3; images of other modes
 #: are converted to RGB.
-MODES = {"L": "mono8", "I;16": "mono16", "I": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
+MODES = {"L": "mono8", "I;16": "mono16", "I;16B": "mono16", "I": "mono16", "F": "32FC1", "RGB": "rgb8", "RGBA": "rgba8"}
 #: Formats that compressed_image_transport sends. Pillow knows many more, and starts Ghostscript for one of them.
 FORMATS = ("JPEG", "PNG", "TIFF")
 
@@ -83,9 +83,8 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
     try:
         with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
             decoded = image if image.mode in MODES else image.convert("RGB")
-            pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
-            if decoded.mode == "I":
-                pixels = pixels.astype(np.uint16)
+            encoding = MODES[decoded.mode]
+            pixels = np.asarray(decoded).astype(ENCODINGS[encoding].type, copy=False)
     except PIL.UnidentifiedImageError as error:  # its text has an address in memory
         raise ValueError(f"an image of the format {image_format!r} that is not JPEG, PNG or TIFF") from error
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:

@@ -160,6 +160,8 @@ def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> N
         ("u1", "PNG", "mono8; png compressed ", "mono8"),
         ("u2", "PNG", "mono16; png compressed ", "mono16"),
         ("i4", "TIFF", "mono16; tiff compressed ", "mono16"),  # decoded as a PNG of 16 bits is by older Pillow
+        (">u2", "TIFF", "mono16; tiff compressed ", "mono16"),
+        ("f4", "TIFF", "32FC1; tiff compressed ", "32FC1"),
         ("u1", "JPEG", "jpeg", "mono8"),
         ("u1", "PNG", "bayer_grbg8; png compressed", "bayer_grbg8"),
         ("3u1", "JPEG", "bgr8; jpeg compressed bgr8", "rgb8"),
@@ -167,13 +169,14 @@ def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> N
     ],
 )
 def test_compressed_images_give_their_pixels(kind: str, file: str, image_format: str, encoding: str) -> None:
-    smooth = np.add.outer(np.arange(16), np.arange(24)) * (1000 if encoding == "mono16" else 3)
-    pixels = np.broadcast_to(smooth[..., None], (16, 24, int(kind[0]))) if len(kind) == 3 else smooth
+    smooth = np.add.outer(np.arange(16), np.arange(24)) * (3 if "8" in encoding else 1000)
+    colours = kind[0].isdigit()
+    pixels = np.broadcast_to(smooth[..., None], (16, 24, int(kind[0]))) if colours else smooth
     written = io.BytesIO()
-    Image.fromarray(pixels.astype(kind[-2:])).save(written, file)
+    Image.fromarray(pixels.astype(kind[colours:])).save(written, file)
     read, name = decompressed(written.getvalue(), image_format)
     assert name == encoding and read.shape == pixels.shape
-    assert read.dtype == (np.uint16 if encoding == "mono16" else np.uint8)
+    assert read.dtype == {"mono16": np.uint16, "32FC1": np.float32}.get(encoding, np.uint8)
     np.testing.assert_allclose(read, pixels, atol=4 if file == "JPEG" else 0)
     if file == "PNG":
         with pytest.raises(ValueError, match="cannot be decoded"):
