@@ -140,6 +140,8 @@ def missing_tools() -> list[tuple[str, str]]:
     except ImportError:
         version = f"{sys.version_info[0]}.{sys.version_info[1]}"
         missing.append(("Python's venv module", f"sudo apt-get install python{version}-venv"))
+    if not str(ROOT).isascii():
+        missing.append((f"a path of ASCII letters: CMake cannot build in {ROOT}", "move this folder"))
     if not sourced_jazzy() and not (sys.platform == "linux" and os.uname().machine == "x86_64"):
         missing.append(
             (

@@ -226,6 +226,13 @@ def test_a_missing_compiler_is_named_with_its_cure(tmp_path: Path) -> None:
     assert not (checkout / ".venv").exists()
 
 
+def test_a_folder_in_which_cmake_cannot_build_is_named_before_anything_is_installed(tmp_path: Path) -> None:
+    (place := tmp_path / "Prüfstand").mkdir()
+    checkout, environment = bare_machine(place)
+    done = subprocess.run([sys.executable, checkout / "dm", "up"], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1 and f"CMake cannot build in {checkout}" in done.stderr
+
+
 def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
     checkout, environment = bare_machine(tmp_path)
     (checkout / ".dm-lock").mkdir()
