@@ -18,6 +18,7 @@ from dm_msgs.srv import Flatten
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
 
 from dm_common.ros.worker import WorkerActionServer, WorkerService
 from ros_fixtures import Observer
@@ -77,6 +78,50 @@ def test_options_that_ros_cannot_read_leave_no_traceback(domain: int, tmp_path: 
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 1 and ended.stdout == ""
     assert "Traceback" not in ended.stderr and options[-1] in ended.stderr.splitlines()[-1]
+
+
+ENDING_SCRIPT = """
+import sys, time
+from dm_common.ros.executor import run_node
+from dm_common.ros.lifecycle import ManagedNode
+from dm_common.ros.parameters import AUTOSTART
+from dm_common.ros.worker import WorkerActionServer
+from dm_msgs.action import MoveFocus
+from std_msgs.msg import String
+
+class Ending(ManagedNode):
+    def __init__(self):
+        super().__init__("ending", (AUTOSTART,))
+        WorkerActionServer(self, MoveFocus, "move", self.run)
+        self.create_subscription(String, "text", self.fail, 10)
+    def fail(self, message):
+        raise KeyError("a defect")
+    def deactivate(self):
+        raise KeyError("another defect")
+    def run(self, goal):
+        while not goal.is_cancel_requested:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        return "canceled", MoveFocus.Result(message="ended")
+
+sys.exit(run_node(Ending))
+"""
+
+
+def test_defects_of_a_node_that_ends_keep_no_result_back(observer: Observer, tmp_path: Path) -> None:
+    script = tmp_path / "ending.py"
+    script.write_text(ENDING_SCRIPT)
+    texts = observer.node.create_publisher(String, "text", 10)
+    with subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as process:
+        _, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+        process.send_signal(signal.SIGINT)
+        while process.poll() is None and not result.done():
+            texts.publish(String(data="text"))
+            time.sleep(0.02)
+        errors = process.communicate(timeout=15)[1]
+    wait_until(result.done)
+    assert result.result().result.message.endswith("ended")
+    assert process.returncode == 0 and "'a defect'" in errors and "'another defect'" in errors
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ import rclpy
 from rclpy.action import ActionClient, ActionServer, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.exceptions import InvalidHandle, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
@@ -64,24 +64,24 @@ def make_executor(node: Node) -> Executor:
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Dispatch events until the ROS context is shut down or `until()` is true. Lifecycle nodes start themselves first.
-
-    A callback that raises is logged with its traceback and the loop goes on.
-    """
+    """Dispatch events until the ROS context is shut down or `until()` is true; lifecycle nodes start themselves."""
     context = executor.context
     for node in executor.get_nodes():
         getattr(node, "autostart", lambda: None)()
         for service in node.services:
             if "send_response" not in vars(service):  # a `worker.WorkerService` has replaced it and sends by itself
                 service.send_response = until_discovered(service.send_response)
-    while context.ok() and not until():
-        try:
-            executor.spin_once(timeout_sec=WAKE_PERIOD_S)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            return
-        except Exception:
-            if not context.ok():
-                return
+    with suppress(KeyboardInterrupt):
+        while context.ok() and not until():
+            spin_once(executor, WAKE_PERIOD_S)
+
+
+def spin_once(executor: Executor, timeout_s: float) -> None:
+    """Dispatch the next events. A callback that raises is logged with its traceback, and the others are served."""
+    try:
+        executor.spin_once(timeout_sec=timeout_s)
+    except Exception:
+        if executor.context.ok():
             _log_exception()
             _serve_rest_of_batch(executor)
 

@@ -12,7 +12,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.executor import ResendingActionServer
+from dm_common.ros.executor import ResendingActionServer, spin_once
 from dm_common.ros.parameters import Parameter, declare
 
 OK = DiagnosticStatus.OK
@@ -145,11 +145,11 @@ class ManagedNode(LifecycleNode):
     def make_safe(self) -> None:
         """At the end of the process: goals end as when the node is deactivated, and their clients are told."""
         if self.requires_activation:
-            self._rest()
+            self._done(self._rest)
         servers = [each for each in self.waitables if isinstance(each, ResendingActionServer) and each.unfinished]
         end = time.monotonic() + GOALS_END_S
         while self.executor is not None and servers and time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.02)
+            spin_once(self.executor, 0.02)
             if not any(each.unfinished for each in servers):
                 end = min(end, time.monotonic() + RESULTS_S)
 
