@@ -247,9 +247,9 @@ class DriverMonitor:
             return Refusal(report.error_code, f"{text}: {report.message}")
         if self._heard < command.sent.steady:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
-        if stamp_ns(report.header.stamp) < command.sent.ns:
-            return Refusal(ErrorCode.TIMEOUT, f"{text}: it holds the earlier shape, no command has reached it since")
         if command.expected_turns:  # a creep correction, which was lost, or which another client's command overtook
             self.order.fall_back(report.requested)
             return None
+        if stamp_ns(report.header.stamp) < command.sent.ns:
+            return Refusal(ErrorCode.TIMEOUT, f"{text}: it holds the earlier shape, no command has reached it since")
         return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another command")

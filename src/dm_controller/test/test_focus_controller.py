@@ -137,6 +137,7 @@ class Bench:
         self.controller = FocusController(VALUES | values)
         self.controller.degauss_offered = lambda: True
         self.time, self.ahead = 1000.0, 0.0  # s, steady, and how far the clock is ahead of it
+        self.written: int | None = None  # stamp of all reports, ns; None = the time of each
         self.signals, self.requested = np.zeros(ACTUATORS), np.zeros(0)
         self.turns = self.degausses = self.sequence = 0
         self.turned_at = np.zeros(0)
@@ -196,7 +197,7 @@ class Bench:
             holder=self.holder,
             holding=f"{self.holder} holds it",
         )
-        report.header.stamp = time_message(self.now.ns)
+        report.header.stamp = time_message(self.now.ns if self.written is None else self.written)
         self.do(self.controller.driver_report(report, self.now))
 
     def degauss(self) -> None:
@@ -934,13 +935,13 @@ def test_a_correction_that_is_lost_is_sent_again(timeout: float) -> None:
     bench.degauss()
     order = bench.ask(0.02)
     bench.wait(2.0)
-    bench.obeys, sent = False, len(bench.commands)
+    bench.obeys, sent, bench.written = False, len(bench.commands), bench.now.ns  # a driver stamps what it has written
     for _ in range(60):
         bench.wait(0.1)
         bench.report()
         assert bench.controller.monitor.progress(order, bench.time).failed is None
     assert len(bench.commands) > sent
-    bench.obeys = True
+    bench.obeys, bench.written = True, None
     bench.wait(3.0)
     assert bench.controller.hold.active and bench.controller.monitor.progress(order, bench.time).reached
     assert bench.error(move_of(order).effective) < 1e-4
