@@ -15,7 +15,9 @@ class ConfigError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 7e-3 as a number, 2024-01-05 and 1:30 as text, as ROS does; refuses aliases and keys that come twice."""
+    """Reads 7e-3 and nan as numbers, y as true, 1:30 as text, as ROS does; refuses aliases and keys that come twice."""
+
+    bool_values = yaml.SafeLoader.bool_values | {"y": True, "n": False}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -32,14 +34,16 @@ class _Loader(yaml.SafeLoader):
 
 _NUMBERS = {
     "tag:yaml.org,2002:int": r"[-+]?(0[0-7]*|[1-9]\d*|0x[\da-fA-F]+)$",
-    "tag:yaml.org,2002:float": r"[-+]?((\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$",
+    "tag:yaml.org,2002:float": r"[-+]?((\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"
+    r"|[-+]?(?i:inf|infinity|nan)$",
 }
 _Loader.yaml_implicit_resolvers = {
     first: [each for each in resolvers if each[0] not in (*_NUMBERS, "tag:yaml.org,2002:timestamp")]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 for _tag, _form in _NUMBERS.items():
-    _Loader.add_implicit_resolver(_tag, re.compile(_form), [*"-+.0123456789"])
+    _Loader.add_implicit_resolver(_tag, re.compile(_form), [*"-+.0123456789iInN"])
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("[yYnN]$"), [*"yYnN"])
 
 
 def read_yaml(text: str) -> Any:

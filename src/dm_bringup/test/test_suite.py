@@ -70,8 +70,8 @@ def test_values_that_ros_does_not_read_are_named(tmp_path: Path, value: str, sai
         load_config(file)
 
 
-NUMBERS = ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "0815", "017", "0x1f", "-.inf"]
-TEXTS = ["'7e-3'", "e5", "7e", "2024-01-05", "10:30", "2024_05", "0b11", "0x_"]
+NUMBERS = ["7e-3", "-.5E+2", "1e5", "2.e0", "[1e5, 0.5]", "0815", "017", "0x1f", "-.inf", "-inf", "Infinity", "y", "N"]
+TEXTS = ["'7e-3'", "e5", "7e", "2024-01-05", "10:30", "2024_05", "0b11", "0x_", "yEs", ".iNF", "infinit"]
 
 
 @pytest.mark.parametrize("text", NUMBERS + TEXTS)
