@@ -409,8 +409,13 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     assert answer.message == "pdm_driver is not active: `ros2 lifecycle set /pdm_driver activate`"
     driver.wait_for_state(lambda state: state.message == answer.message, "the reason")
     driver.command(np.zeros(37))
-    driver.wait_for_state(lambda state: state.error_code == ErrorCode.DRIVER_INACTIVE, "refusal")
-    assert unit.raw == b""
+
+    def refused() -> bool:
+        values = {item.key: item.value for message in driver.diagnostics[-1:] for item in message.status[0].values}
+        return values.get("refused DRIVER_INACTIVE") == "3"  # with the two calls
+
+    wait_until(refused, what="refusal")
+    assert unit.raw == b"" and driver.states[-1].error_code == ErrorCode.DRIVER_INACTIVE
 
     assert driver.change(Transition.TRANSITION_ACTIVATE)
     driver.wait_active()
