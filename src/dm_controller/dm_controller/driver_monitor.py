@@ -179,7 +179,7 @@ class DriverMonitor:
         """The reason why the driver cannot finish what it has begun; "" = it can: a lost link comes back."""
         report = self.latest
         if report is not None and report.driver_state in _STOPPED and not self.loss:
-            return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
+            return "pdm_driver left its active state" + (f" ({report.message})" if report.message else "")
         return self.silent(now)
 
     def keeps(self, order: Order) -> bool:

@@ -755,7 +755,7 @@ def unreported(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("accident", "code", "text"),
     [
-        (stopped, ErrorCode.DRIVER_UNAVAILABLE, "left its active state: deactivated"),
+        (stopped, ErrorCode.DRIVER_UNAVAILABLE, "left its active state (deactivated)"),
         (restarted, ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver was restarted"),
         (silent, ErrorCode.DRIVER_UNAVAILABLE, "has not reported"),
         (refused, ErrorCode.BUSY, "a degauss is under way"),

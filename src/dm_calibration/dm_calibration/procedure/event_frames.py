@@ -85,7 +85,7 @@ def _event(head: dict[str, Any], payload: memoryview, setup: Setup | None) -> Ev
             if setup is None:
                 raise KeyError("points")
             shared = {name: getattr(setup, name) for name in _SHARED}
-            values = {"record": Measurement(**shared | values["record"])}  # before 0.2 a frame held more of its map
+            values = {"record": Measurement(**shared | values["record"])}  # older frames hold more of it
         if "points" in values:
             values["points"] = SamplePoints(**values["points"])
         event: Event | Storing = _EVENTS[head["event"]](**values)

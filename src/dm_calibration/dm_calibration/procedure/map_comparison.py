@@ -19,7 +19,7 @@ _PROPERTIES = {
     "camera": "camera of {0[0]} x {0[1]} pixels, {1} {2[0]} x {2[1]}",
     "pitch": "pixel pitch {:.3f} um, {} {:.3f} um (0 = not known)",
     "orientation": "orientation (flip_x, flip_y, rotate_deg) {}, {} {}",
-    "reference_surface": "reference_surface {!r}, {} {!r}",
+    "reference_surface": "reference_surface {}, {} {}",
     "system_error_subtracted": "system_error_subtracted = {}, {} {} (1 = the instrument had subtracted its own error)",
 }
 #: Units of those that are lengths, m; such values may differ by rounding.
@@ -82,7 +82,7 @@ def other_setup(measured: Measurement, other: Any, names: Iterable[str], whose: 
         if unit := _UNITS.get(name):
             same, here, there = np.isclose(here, there, rtol=SAME_LENGTH, atol=0.0), here / unit, there / unit
         if not same:
-            return _PROPERTIES[name].format(here, whose, there)
+            return _PROPERTIES[name].format("none" if here == "" else here, whose, "none" if there == "" else there)
     return ""
 
 

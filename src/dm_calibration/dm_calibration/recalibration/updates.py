@@ -239,8 +239,9 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
     names = ("wavelength", "reference_surface", *(("system_error_subtracted",) if known else ()))
     whose, tolerance = "the calibration's is", options.aperture_tolerance
     different = other_setup(measured, calibration, names, whose)
-    if different := different or other_aperture(measured, calibration.aperture_radius, tolerance, whose):
-        raise MapNotUsableError(different)
+    different = different or other_aperture(measured, calibration.aperture_radius, tolerance, whose)
+    if different:
+        raise MapNotUsableError(f"{different}: set instrument and interferometer as they were, or calibrate anew")
     seen, least = float(np.isfinite(measured.sag) @ calibration.fit.points.weight), options.valid_fraction_min
     for share, text in ((measured.valid_fraction, "the pixels are valid"), (seen, "the sampled area has data")):
         if not share >= least:

@@ -125,8 +125,10 @@ class Edac40Tcp(_Edac40):
         if self._last is None:
             return
         deadline = time.monotonic() + self._timeout_s
-        # The time is taken first: after this process was stopped, the unit is asked once more.
-        while (now := time.monotonic()) and self._on_the_way():
+        while True:
+            now = time.monotonic()  # taken first: after this process was stopped, the unit is asked once more
+            if not self._on_the_way():
+                break
             if self._arrived is not None:
                 away = np.abs(codes.astype(np.int64) - self._arrived).max()
                 if 2 * away <= self._settings.doubt:

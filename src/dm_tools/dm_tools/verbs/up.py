@@ -149,7 +149,8 @@ def lacks(messages: Mapping[str, Any]) -> str:
 
     state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
     if state is None or state.driver_state != state.STATE_ACTIVE:
-        return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
+        reason = state.message if state is not None else ""
+        return reason if reason.startswith("pdm_driver") else f"pdm_driver: {reason or 'not active'}"
     if capabilities is not None and capabilities.error_code in RESTING:
         return str(capabilities.message or "focus_controller takes no requests yet")
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
