@@ -190,6 +190,17 @@ def test_bounds_count_creep_from_the_last_check_on() -> None:
     assert whole[2] > 0.8 * none[2]  # what was held since is as uncertain as ever
 
 
+def test_recipes_and_figure_count_what_fades_after_a_check_alike() -> None:
+    """Maps shift both by what was held unseen; the recipe by nothing else here, since its creep is known."""
+    law = replace(CREEPS, creep_covariance=np.zeros((2, 1 + len(CREEP_TIMES), 1 + len(CREEP_TIMES))))
+    rest = np.zeros(COUNT)
+    checked = law.degaussed(rested(law, rest, 0.0), 60.0)
+    error = creep_error(law, CreepShown(checked.time, checked.crept, checked.crept_sigma, 1.0))
+    later = law.advance(checked, 30_000.0)
+    figure, recipe = (error.bound(later, rest, 0.05, measured).max_zernike for measured in (False, True))
+    assert recipe == pytest.approx(figure) and recipe > 2.0 * error.bound(checked, rest, 0.05, True).max_zernike
+
+
 def test_a_longer_move_is_known_less_well() -> None:
     error = creep_error(CREEPS)
     state = CREEPS.demagnetised(COUNT, 0.0)

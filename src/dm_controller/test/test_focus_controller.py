@@ -568,6 +568,24 @@ def test_a_check_map_that_shows_old_creep_narrows_the_bounds() -> None:
     assert bound(revision=0) == pytest.approx(before, rel=0.1)  # updates were dropped
 
 
+def test_a_check_map_widens_the_bounds_of_later_hours_by_what_it_shows_only() -> None:
+    """Old creep that it finds is in the figure and fades: little of it if the map agrees with the figure before it."""
+
+    def later(changed: float) -> float:
+        bench = Bench()
+        bench.degauss()
+        bench.time += 1800.0
+        bench.report()
+        message = calibration(revision=1, checked=time_message(bench.now.ns), creep_shown=1.0)
+        message.zernike_offset[5] = changed
+        bench.do(bench.controller.use(message, MIRROR))
+        bench.time += 8 * 3600.0
+        bench.report()
+        return move_of(bench.ask(dry_run=True)).plan.max_zernike_upper
+
+    assert later(0.0) < 0.1 * later(1e-7) < 0.1 * later(2e-7)
+
+
 def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     bench = Bench()
     still, none = np.zeros((ACTUATORS, 15)), np.zeros((ACTUATORS, 0))

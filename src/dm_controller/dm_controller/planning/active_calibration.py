@@ -16,6 +16,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, mirror_from, recipe_book_from, stamp_ns, taken
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
+from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
@@ -92,7 +93,11 @@ class ActiveCalibration:
             planner.creep_shown = before.planner.creep_shown
         elif state is not None:
             state = planner.law.advance(state, max(state.time, 1e-9 * stamp_ns(last)))
-            planner.note_creep_shown(state, self.calibration.creep_shown)
+            shown = before.planner.creep_shown
+            moved = self.mirror.model.zernike_offset - before.mirror.model.zernike_offset
+            change = float(np.abs(moved[PISTON_TILT:]).max())  # beyond that of earlier checks, or the error of one map
+            change += planner.error_bound(known=True) if shown is None else shown.change
+            planner.note_creep_shown(state, self.calibration.creep_shown, change)
 
     def stale(self, now_ns: int, age_max_s: float) -> str:
         """The reason why the calibration should be renewed; "" = it is fresh, or of unknown age."""

@@ -44,12 +44,14 @@ class CreepShown(NamedTuple):
         crept: (N, J) states of the creep elements then.
         sigma: (J,) `crept_sigma` then, see :class:`~dm_common.hysteresis.model.HysteresisState`.
         share: share of the slow creep until then that the figure includes since.
+        change: m, largest coefficient by which the figure may have changed with it; infinite = not known.
     """
 
     time: float
     crept: Floats
     sigma: Floats
     share: float
+    change: float = np.inf
 
 
 class CreepError:
@@ -83,6 +85,9 @@ class CreepError:
         share = np.atleast_2d(law.creep_share).mean(axis=0)
         share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # of elements that follow the signals
         self._unseen = (rows @ whole)[:, None] * share
+        # What was held unobserved cannot have left more than maps show: the figure changed by their share of it.
+        effect = float(np.abs(self._unseen[: len(zernike)] @ (self._share * self._shown.sigma)).max())
+        self._left = min(1.0, self._shown.change / effect) if effect > 0.0 else 1.0
         # What was held before the calibration fades for hours. A run of minutes shows its size, but hardly which
         # actuators it is in: each may deviate from what was found by a share of the rms over all.
         found = float(np.sqrt(np.mean(np.square(law.crept)))) if law.crept.size else 0.0
@@ -112,8 +117,9 @@ class CreepError:
         time, shown = self._law.creep_time, self._shown
         same = np.minimum(shown.sigma * np.exp(-np.maximum(state.time - shown.time, 0.0) / time), state.crept_sigma)
         since = np.sqrt(np.square(state.crept_sigma) - np.square(same))
-        figure = 0.0 if measured else self._share * shown.sigma
-        unseen = np.square((same * faded - figure) @ self._unseen.T) + np.square((since * faded) @ self._unseen.T)
+        figure = self._share * shown.sigma  # maps shift recipes as they shift the figure
+        unseen = np.square(self._left * (same * faded - figure) @ self._unseen.T)
+        unseen += np.square((since * faded) @ self._unseen.T)
         shared += unseen
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
         if not measured:

@@ -229,11 +229,11 @@ class Planner:
         """Largest coefficient beyond tilt, m, of effective signals (N,)."""
         return float(np.abs(self._zernike @ effective).max())
 
-    def note_creep_shown(self, state: HysteresisState, share: float) -> None:
-        """Count this `share` of the slow creep until the time of `state` as in the figure; call it before any plan."""
+    def note_creep_shown(self, state: HysteresisState, share: float, change: float = math.inf) -> None:
+        """Count creep until the time of `state` as in the figure, see `CreepShown`; call it before any plan."""
         from dm_controller.planning.creep_error import CreepShown  # a command does not wait for it
 
-        self.creep_shown = CreepShown(state.time, state.crept, state.crept_sigma, share)
+        self.creep_shown = CreepShown(state.time, state.crept, state.crept_sigma, share, change)
 
     @cached_property
     def _whole(self) -> Floats:
