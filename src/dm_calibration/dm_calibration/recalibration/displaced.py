@@ -20,12 +20,16 @@ from dm_common.optics.zernike import PISTON_TILT, basis
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 #: Prior standard deviation of the displacement of a faulty actuator, in effective signal.
 DISPLACED_SIGMA = 0.5
+#: The same of a change of one coefficient, as by another focus of the interferometer, m rms.
+TERM_SIGMA = 1e-7
 #: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
 #: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
 DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
 #: displacements of up to 0.03.
 FAILED_SIGNAL = 0.05
+#: No actuator stands at an effective signal beyond this.
+FURTHEST = 1.5
 #: From data sheets of piezo mirrors: rise of the surface over an actuator per unit signal, m, and width of the bump
 #: (standard deviation, in pitches).
 TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
@@ -55,7 +59,7 @@ def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -
 
 
 def displaced_actuators(
-    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: Bools
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: Bools, coefficients: int
 ) -> dict[int, Displaced]:
     """Actuators whose displacement explains `innovation` (R,), found one by one by generalised least squares.
 
@@ -63,9 +67,12 @@ def displaced_actuators(
         gain: (R, N) per unit of effective signal, see :func:`visible_gain`.
         factor: Cholesky factor of the expected covariance (R, R).
         silent: (N,) actuators without a measured gain, for which the typical gain is used.
+        coefficients: how many of the values are Zernike coefficients; the first ones.
     """
-    white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
-    columns, whole = white[:, :-1], white[:, -1]
+    values = np.column_stack((gain, innovation, np.eye(len(innovation))[:, :coefficients]))
+    white = solve_triangular(factor[0], values, trans="T")
+    columns, whole, terms = np.split(white, [gain.shape[1], gain.shape[1] + 1], axis=1)
+    whole = whole[:, 0]
     power = np.maximum(np.square(columns).sum(axis=0), np.finfo(np.float64).tiny)
     left, found, amounts = whole, list[int](), np.zeros(0)
     while len(found) < DISPLACED_MAX and left @ left > len(left):
@@ -82,17 +89,18 @@ def displaced_actuators(
     displaced = {}
     for k in order:
         of_this = left + columns[:, found[k]] * amounts[k]
-        probability = _probability(columns, power, of_this, silent)[found[k]]
+        probability = _probability(columns, power, of_this, silent, terms)[found[k]]
         displaced[found[k]] = Displaced(float(amounts[k]), float(probability))
     return displaced
 
 
-def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools) -> Floats:
+def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools, terms: Floats) -> Floats:
     """(N,) probability that each actuator alone causes the difference `white` (R,), against any other cause.
 
-    An actuator may be anywhere in its range. A cause other than an actuator changes all values, by an unknown amount
-    estimated from `white`; for a `silent` actuator, whose bump is not known, the same holds for its residual. The prior
-    is one half for all actuators together, and one half for other causes.
+    An actuator may be anywhere in its range. A cause other than an actuator changes one coefficient, by its column of
+    `terms` (R, K - 3), or all values, by an unknown amount estimated from `white`; for a `silent` actuator, whose bump
+    is not known, the same holds for its residual. The prior is one half for all actuators together, and one half for
+    other causes.
     """
     size, whole = len(white), white @ white
     precision = 1.0 / DISPLACED_SIGMA**2
@@ -100,7 +108,10 @@ def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools) -
     left = np.where(silent, _deviance(left, size), left)
     evidence = 0.5 * (whole - left) - 0.5 * np.log1p(power / precision)
     other_cause = 0.5 * (whole - _deviance(whole, size))
-    all_of_them = np.append(evidence - np.log(evidence.size), other_cause)
+    strength, precision = np.square(terms).sum(axis=0), 1.0 / TERM_SIGMA**2
+    one_term = 0.5 * np.square(terms.T @ white) / (strength + precision) - 0.5 * np.log1p(strength / precision)
+    others = np.append(other_cause - np.log(2.0), one_term - np.log(2.0 * max(one_term.size, 1)))
+    all_of_them = np.concatenate((evidence - np.log(evidence.size), others))
     return np.asarray(np.exp(all_of_them - np.logaddexp.reduce(all_of_them)))
 
 
@@ -128,6 +139,7 @@ def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bo
         given_up: (N,) actuators that are already known not to move any more.
         silent: (N,) which showed no response in the calibration.
     """
+    displaced = {k: one for k, one in displaced.items() if abs(expected[k] + one.more) <= FURTHEST}
     if not displaced:
         return "bad map, or the mirror has changed"
     sure = sorted(actuator for actuator, one in displaced.items() if one.probability >= SURE)

@@ -146,7 +146,7 @@ class Drift:
 class Displaced(NamedTuple):
     """A displaced actuator: its displacement in effective signal, and the probability that it is displaced.
 
-    The alternatives are any other actuator and a map that is bad everywhere.
+    The alternatives are any other actuator, a change of one coefficient alone, and a map that is bad everywhere.
     """
 
     more: float

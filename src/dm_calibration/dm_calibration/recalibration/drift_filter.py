@@ -181,7 +181,7 @@ class DriftFilter:
             rms=float(rms(departure, self._fit.points.weight)),
             surprise=surprise_of(innovation, seen.expected, factor),
             updated=updated,
-            displaced=displaced_actuators(innovation, self._visible, factor, self._silent),
+            displaced=displaced_actuators(innovation, self._visible, factor, self._silent, self.reduction.coefficients),
         )
 
     def give_up(
