@@ -290,6 +290,21 @@ def test_a_weakened_actuator_is_named_with_its_probability(bench: SteadyMirror, 
     assert "as if weakened to 60% (100%); if it is at the same place in another shape, ./dm check" in verdict.reason
 
 
+@pytest.mark.parametrize(("away", "named"), [(0.0, False), (0.03, True)])
+def test_a_map_that_agrees_names_an_actuator_that_begins_to_fail(
+    bench: SteadyMirror, made: Made, tmp_path: Path, away: float, named: bool
+) -> None:
+    """One that lost 10 % within a week was told when maps disagreed, days after bounds had ceased to hold."""
+    settled = bench.settled()
+    at = bench.signals.copy()
+    at[4] += away
+    bench.apply(at)
+    verdict = begun(made, tmp_path, UpdateOptions(signal_sigma=5e-3)).take(bench.measure("weak"), settled)
+    assert verdict.accepted
+    assert ("expected difference; actuator 5 stands at +0.18 instead of +0.15 (100%)" in verdict.reason) == named
+    assert named or verdict.reason.endswith("expected difference")
+
+
 def test_an_error_of_the_law_is_not_put_down_to_actuators(bench: SteadyMirror, updates: RecalibrationManager) -> None:
     """It passed for two actuators displaced by a few hundredths of a signal, which were to be given up."""
     settled = bench.settled()

@@ -26,8 +26,8 @@ TERM_SIGMA = 1e-7
 #: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
 DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
-#: displacements of up to 0.03.
-FAILED_SIGNAL = 0.05
+#: displacements of up to 0.03; and at which it is named where the map agrees.
+FAILED_SIGNAL, NOTICED = 0.05, 0.01
 #: No actuator stands at an effective signal beyond this.
 FURTHEST = 1.5
 #: From data sheets of piezo mirrors: rise of the surface over an actuator per unit signal, m, and width of the bump

@@ -17,7 +17,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_comparison import other_aperture, other_setup
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import described, without_response, worst_other_error
+from dm_calibration.recalibration.displaced import NOTICED, SURE, described, without_response, worst_other_error
 from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
@@ -159,10 +159,12 @@ class RecalibrationManager:
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs from the prediction by {comparison.surprise:.1f} times the expected difference"
             found = comparison.displaced, updates.reached(settled.effective)
+            causes = described(*found, np.isfinite(kept.drift.stuck), without_response(calibration))
             if not accepted:
-                reason += f", more than {options.surprise_max:g}: "
-                reason += described(*found, np.isfinite(kept.drift.stuck), without_response(calibration))
-            elif without:
+                reason += f", more than {options.surprise_max:g}: {causes}"
+            elif any(one.probability >= SURE and abs(one.more) >= NOTICED for one in comparison.displaced.values()):
+                reason += f"; {causes}"
+            if accepted and without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
