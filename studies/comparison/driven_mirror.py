@@ -13,6 +13,7 @@ from dm_common.measurement import Measurement
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
+from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
 from dm_controller.planning.recipes import Corrections, UnreachableError
 from dm_controller.planning.target import FocusTarget
@@ -98,16 +99,11 @@ class DrivenMirror:
             self._tracker.observe(report)
         self._seen = len(self.bench.reports)
 
-    def under(self, planner: Planner, creep_shown: float) -> DrivenMirror:
-        """The same mirror from here on with another planner of the same hysteresis model.
-
-        Args:
-            creep_shown: of its calibration, as the message says.
-        """
+    def under(self, active: ActiveCalibration, before: ActiveCalibration) -> DrivenMirror:
+        """The same mirror from here on with the calibration `active`, which check maps have made of `before`."""
         other = copy.copy(self)
-        assert self._tracker.state is not None
-        planner.note_creep_shown(self._tracker.state, creep_shown)
-        other._plan_with(planner)
+        active.note_creep_shown(before, self._tracker.state)
+        other._plan_with(active.planner)
         return other
 
     def settled(self) -> SettledState:

@@ -175,15 +175,14 @@ def _evaluated(mirror: DrawnMirror, options: PopulationOptions, folder: str, pro
         progress(f"seed {seed}: recipes")
         curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
         book, unreachable = build_recipes(bench, active.planner, curvatures, updated.take)
-        active = updated.active()
+    before, active = active, updated.active()
     _age(bench, mirror, rng)
 
     progress(f"seed {seed}: any order")
     dwells = rng.permutation(np.resize(DWELLS, options.requests))
     other = bench.fork()
     driven = DrivenMirror(other, active.planner)
-    if options.recipes:
-        driven = driven.under(active.planner, active.calibration.creep_shown)
+    driven = driven.under(active, before)
     groups[ANY_ORDER] = judge_requests(driven, active, surface, draw_targets(active, options.requests, rng), dwells)
     # From there on, a move that is ended by a power cut.
     progress(f"seed {seed}: power cut")
@@ -199,7 +198,8 @@ def _evaluated(mirror: DrawnMirror, options: PopulationOptions, folder: str, pro
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     driven = DrivenMirror(other, active.planner)
     driven.hold(driven.go(driven.plan(first[0])), HELD_S)
-    driven = _restarted(other, updated.active(), OFF_S, driven.record())
+    before = updated.active()
+    driven = _restarted(other, before, OFF_S, driven.record())
     groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
     progress(f"seed {seed}: check maps")
     for target in draw_targets(active, CHECK_MAPS, rng):
@@ -207,7 +207,7 @@ def _evaluated(mirror: DrawnMirror, options: PopulationOptions, folder: str, pro
         updated.take(other.measure("check"), driven.settled())
     checked = updated.active()
     first = draw_targets(checked, FIRST_REQUESTS, rng)
-    driven = driven.under(checked.planner, checked.calibration.creep_shown)
+    driven = driven.under(checked, before)
     groups[CHECKED] = judge_requests(driven, checked, surface, first, short)
 
     groups[RECIPES] = Requests.none(unreachable)
