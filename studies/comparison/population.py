@@ -181,8 +181,7 @@ def _evaluated(mirror: DrawnMirror, options: PopulationOptions, folder: str, pro
     progress(f"seed {seed}: any order")
     dwells = rng.permutation(np.resize(DWELLS, options.requests))
     other = bench.fork()
-    driven = DrivenMirror(other, active.planner)
-    driven = driven.under(active, before)
+    driven = DrivenMirror(other, active.planner).under(active, before)
     groups[ANY_ORDER] = judge_requests(driven, active, surface, draw_targets(active, options.requests, rng), dwells)
     # From there on, a move that is ended by a power cut.
     progress(f"seed {seed}: power cut")

@@ -191,7 +191,7 @@ class FocusController:
                 assert active is not None  # else it is refused
                 raise unreachable(move, active, tolerance)
             if not dry_run:
-                if not now.ns and (refusal := now.refusal):
+                if now.simulated and (refusal := now.refusal):
                     raise refusal
                 if now.steady > self.monitor.open_until:
                     self.monitor.check(order.request, now.steady)

@@ -88,10 +88,11 @@ class SafetyLimiter:
         Raises:
             Refusal: STALE.
         """
-        name, place = ("lead", "in the future") if age_s < 0.0 else ("age", "old")
-        most = getattr(self.limits, f"command_{name}")
+        most, name, place = self.limits.command_age, "limits.command_age", "old"
+        if age_s < 0.0:
+            most, name, place = self.limits.command_lead, "limits.command_lead", "in the future"
         if not abs(age_s) <= most:
-            rule = f"must be at most {most:g} s (limits.command_{name}); do the clocks agree?"
+            rule = f"must be at most {most:g} s ({name}); do the clocks agree?"
             raise Refusal(ErrorCode.STALE, f"header.stamp is {abs(age_s):.3f} s {place}: {rule}")
 
     def check_write(self, previous: Shape | None, shape: Shape) -> None:

@@ -108,8 +108,8 @@ def _probability(columns: Floats, power: Floats, white: Floats, silent: Bools, t
     left = np.where(silent, _deviance(left, size), left)
     evidence = 0.5 * (whole - left) - 0.5 * np.log1p(power / precision)
     other_cause = 0.5 * (whole - _deviance(whole, size))
-    strength, precision = np.square(terms).sum(axis=0), 1.0 / TERM_SIGMA**2
-    one_term = 0.5 * np.square(terms.T @ white) / (strength + precision) - 0.5 * np.log1p(strength / precision)
+    strength, of_term = np.square(terms).sum(axis=0), 1.0 / TERM_SIGMA**2
+    one_term = 0.5 * np.square(terms.T @ white) / (strength + of_term) - 0.5 * np.log1p(strength / of_term)
     others = np.append(other_cause - np.log(2.0), one_term - np.log(2.0 * max(one_term.size, 1)))
     all_of_them = np.concatenate((evidence - np.log(evidence.size), others))
     return np.asarray(np.exp(all_of_them - np.logaddexp.reduce(all_of_them)))

@@ -237,8 +237,9 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             "the map is sampled at other points than the calibration, made with another interferometer node or "
             "version: calibrate anew"
         )
-    known = -1 not in (measured.system_error_subtracted, calibration.system_error_subtracted)
-    names = ("wavelength", "reference_surface", *(("system_error_subtracted",) if known else ()))
+    names = ["wavelength", "reference_surface"]
+    if -1 not in (measured.system_error_subtracted, calibration.system_error_subtracted):
+        names.append("system_error_subtracted")
     whose, tolerance = "the calibration's is", options.aperture_tolerance
     different = other_setup(measured, calibration, names, whose)
     different = different or other_aperture(measured, calibration.aperture_radius, tolerance, whose)

@@ -106,9 +106,8 @@ class Corrections:
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
         now = [planner.mirror.command(shape)[0] for shape in shapes]
-        updated = [recipe.by_model.size and checked_ns > recipe.stamp_ns for recipe in recipes]
-        known = zip(recipes, updated, now, strict=True)
-        then = np.array([recipe.by_model if moved else own for recipe, moved, own in known])
+        known = zip(recipes, now, strict=True)
+        then = np.array([r.by_model if r.by_model.size and checked_ns > r.stamp_ns else own for r, own in known])
         tilt = self._other_tilt(then)
         self._then, self._own = then + tilt, np.array(now) + tilt
         self._corrections = self._effective - self._then

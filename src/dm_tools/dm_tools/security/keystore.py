@@ -89,12 +89,18 @@ def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
         for text, names in (("more than the policy", allowed - wanted), ("missing", wanted - allowed)):
             if names:
                 found.append(f"{path}: {rule}: {text}: {', '.join(sorted(names)[:5])}")
-    said = {"not_before": "not valid before", "not_after": "not valid any more since"}
-    for item in (each for each in document.iter() if each.tag in said):
-        date = datetime.fromisoformat(str(item.text))
-        if ((date if date.tzinfo else date.replace(tzinfo=UTC)) < datetime.now(UTC)) is (item.tag == "not_after"):
-            found.append(f"{path}: {said[item.tag]} {item.text}")
+    now = datetime.now(UTC)
+    found += [f"{path}: not valid before {each.text}" for each in document.iter("not_before") if _date(each) > now]
+    found += [
+        f"{path}: not valid any more since {each.text}" for each in document.iter("not_after") if _date(each) < now
+    ]
     return found
+
+
+def _date(element: xml.Element) -> datetime:
+    """The date in an element, of UTC if it names no time zone."""
+    date = datetime.fromisoformat(str(element.text))
+    return date if date.tzinfo else date.replace(tzinfo=UTC)
 
 
 def _plain(path: Path) -> str:
