@@ -7,6 +7,7 @@ from dm_msgs.msg import FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import ActuatorEstimate
+from dm_common.messages import taken
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
@@ -124,9 +125,8 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
         estimate.state,
         begin,
         estimate.known,
-        effective=recipe.effective if recipe is not None else None,
         ahead=context.settle,
-        error=recipe.error if recipe is not None else None,
+        **(taken(recipe, "effective", "error", "built") if recipe is not None else {}),
     )
     return replace(move, duration=degauss.wait + move.duration, degauss=None if degauss.begun else degauss.steps)
 

@@ -93,14 +93,16 @@ class CreepError:
         found = float(np.sqrt(np.mean(np.square(law.crept)))) if law.crept.size else 0.0
         self._old = UNKNOWN_SHARE * found * share
 
-    def bound(self, state: HysteresisState, position: Floats, ahead: float, measured: bool = False) -> CreepBound:
+    def bound(
+        self, state: HysteresisState, position: Floats, ahead: float, measured: float | None = None
+    ) -> CreepBound:
         """Bound of a move from `state` to static effective signals `position` (N,), `ahead` s after it and at AGES.
 
         The largest of these, since a held shape is corrected by the same law.
 
         Args:
-            measured: the same shape was measured at ages within MEASURED_S, on a mirror without older creep (a recipe):
-                only the difference from then counts.
+            measured: s, when the same shape was measured at ages within MEASURED_S on a mirror degaussed before (a
+                recipe): only the difference from then counts. 0 = not known, so in the run of the calibration.
         """
         ages = np.array([ahead, *(age for age in AGES if age > ahead)])
         faded = np.exp(-ages[:, None] / self._law.creep_time)  # (T, J)
@@ -108,7 +110,7 @@ class CreepError:
         features = np.concatenate(
             (np.broadcast_to(position[:, None], (*followed.shape[:2], 1)), followed - self._in_figure), axis=2
         )
-        if measured:
+        if measured is not None:
             then = np.exp(-np.clip(ages, *MEASURED_S)[:, None] / self._law.creep_time)
             features[:, :, 0] = 0.0
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
@@ -122,10 +124,10 @@ class CreepError:
         unseen += np.square((since * faded) @ self._unseen.T)
         shared += unseen
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
-        if not measured:
-            at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
-            fade = np.exp(-np.maximum(at, 0.0)[:, None] / time) - np.exp(-IN_FIGURE_S / time)
-            each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
+        then_s = max((measured or 0.0) - self._law.crept_at, IN_FIGURE_S)
+        at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
+        fade = np.exp(-np.maximum(at, 0.0 if measured is None else then_s)[:, None] / time) - np.exp(-then_s / time)
+        each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
         each = each @ np.square(self._rows).T
         count = self._coefficients
         largest = SIGMAS_95**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)

@@ -126,6 +126,7 @@ class Planner:
         effective: Floats | None = None,
         ahead: float = 0.0,
         error: float | None = None,
+        built: float = 0.0,
     ) -> Move:
         """The move to `target` that begins at `time` (s) from `state`.
 
@@ -134,7 +135,8 @@ class Planner:
             known: whether the state can be trusted; if not, the bounds are widened.
             effective: (N,) effective signals to aim at instead of the model's own (a recipe).
             ahead: s after the end of the move at which the shape is to be right; creep is quickest just after a move.
-            error: m, 95 % bound of the largest coefficient error under `effective`, where it was measured.
+            error: m, 95 % bound of the largest coefficient error under `effective`, as measured.
+            built: s, when it was measured; 0 = not known.
 
         Raises:
             TargetError: no such surface exists over the aperture.
@@ -157,8 +159,7 @@ class Planner:
             state = rested(law, np.full(len(aim), middle), time, middle)
         else:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
-        # A move's creep counts from its last write; older creep goes on during the move.
-        begun, arrival = state, time + travel
+        begun, arrival = state, time + travel  # older creep goes on during the move
         signals, residual = aim, None
         if self.hysteresis is not None or effective is not None:
             signals, residual = self._inverted(begun, arrival, aim, ahead, target if effective is None else None, cut)
@@ -178,7 +179,8 @@ class Planner:
             creep = None
             if law.creep_rate:
                 at = law.advance(begun, arrival)
-                creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
+                position, measured = law.position_at(at, signals), None if error is None else built
+                creep = self._creep_error.bound(at, position, ahead, measured)
             return self._bounded(plan, signals, known, creep, error)
 
         def drift() -> tuple[float, float]:
@@ -222,8 +224,7 @@ class Planner:
 
     def drift(self, state: HysteresisState, time: float, effective: Floats) -> float:
         """Largest coefficient error (m) at `time` (s) of a mirror that should be at `effective` (N,)."""
-        gap = self.law.effective(self.law.advance(state, time)) - effective
-        return self._largest(gap)
+        return self._largest(self.law.effective(self.law.advance(state, time)) - effective)
 
     def _largest(self, effective: Floats) -> float:
         """Largest coefficient beyond tilt, m, of effective signals (N,)."""

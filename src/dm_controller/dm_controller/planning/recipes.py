@@ -49,10 +49,12 @@ class FoundRecipe:
         effective: (N,) effective signals.
         error: m, bound of the largest coefficient error without creep: as re-measured at the recipes used, plus the
             possible change of the correction away from them.
+        built: s, when the oldest of the recipes used was measured; 0 = not known.
     """
 
     effective: Floats
     error: float
+    built: float
 
 
 class Kriging:
@@ -161,9 +163,9 @@ class Corrections:
             least = int(np.abs(changes).max(axis=1).argmin())
             recipe, change = int(same[least]), changes[least]
             measured = float(self._measured[recipe])
-            if np.abs(change).max() <= SAME_SIGNALS:
-                return FoundRecipe(self._effective[recipe], self._bound(measured, 0.0))
-            return FoundRecipe(self._effective[recipe] + change, self._bound(measured, self._kriging.at(own)[1]))
+            shift, left = (0.0, 0.0) if np.abs(change).max() <= SAME_SIGNALS else (change, self._kriging.at(own)[1])
+            built = 1e-9 * self._recipes[recipe].stamp_ns
+            return FoundRecipe(self._effective[recipe] + shift, self._bound(measured, left), built)
         curvatures = [recipe.curvature for recipe in self._recipes]
         inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
         if inside.deviation(target, self._mirror.model.aperture_radius) > SAME_SHAPE:
@@ -178,7 +180,8 @@ class Corrections:
             )
         near = np.abs(weights) >= SLIGHT * np.abs(weights).max()
         error = self._bound(float(self._measured[near].max()), left)
-        return FoundRecipe(own + weights @ self._corrections, error)
+        built = 1e-9 * min(one.stamp_ns for one, used in zip(self._recipes, near, strict=True) if used)
+        return FoundRecipe(own + weights @ self._corrections, error, built)
 
     @cached_property
     def worst(self) -> float:
