@@ -31,6 +31,7 @@ from sensor_msgs.msg import Image
 from dm_client.connection import RESTING, Connection, DeformableMirrorError, Watched
 from dm_client.fields import filled
 from dm_common.errors import ErrorCode
+from dm_common.messages import driver_refusal
 from dm_common.ros import qos
 
 TOPICS = {
@@ -126,12 +127,11 @@ class DeformableMirrorClient(Connection):
         """Wait until the driver, and the controller if there is one, take requests. Raises DeformableMirrorError."""
 
         def refusal() -> tuple[int, str]:
-            if (driver := self._servers["set_signals"]).lost:
-                return ErrorCode.DRIVER_UNAVAILABLE, driver.text
             state, able = self.messages.get("actuator_state"), self.messages.get("capabilities")
-            if state is None or state.driver_state != ActuatorState.STATE_ACTIVE:
-                reason = (state.message or "it is not active") if state else "it is not heard: are the nodes running?"
-                return ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}"
+            if (driver := self._servers["set_signals"]).lost or state is None:
+                return ErrorCode.DRIVER_UNAVAILABLE, driver.text if driver.lost else "pdm_driver: is it running?"
+            if (refused := driver_refusal(state)) is not None:
+                return refused.error_code, str(refused)
             return (able.error_code, able.message) if able and able.error_code in RESTING else (0, "")
 
         if not self.wait(lambda: not refusal()[0], timeout_s) and (refused := refusal())[0]:

@@ -14,6 +14,7 @@ from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_common.limits import Limits
@@ -136,6 +137,17 @@ def measurement_from(response: Any) -> Measurement:
     )
 
 
+def driver_refusal(report: ActuatorState) -> Refusal | None:
+    """The refusal by a driver that takes no commands, with the code that it would answer; None = it takes them."""
+    if report.driver_state == ActuatorState.STATE_ACTIVE:
+        return None
+    reason = f": {report.message}" if report.message else ""
+    if report.driver_state == ActuatorState.STATE_LINK_LOST:
+        return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, f"pdm_driver has lost the link to the electronics{reason}")
+    says_so = report.message and report.driver_state != ActuatorState.STATE_SAFING  # and what to do
+    return Refusal(ErrorCode.DRIVER_INACTIVE, report.message if says_so else f"pdm_driver is not active{reason}")
+
+
 def unused_as_requested(report: ActuatorState) -> ActuatorState:
     """For actuators without a channel, set the applied signals to the requested ones: they cannot move, so the
     difference is not a shape to correct or to keep.
@@ -194,7 +206,6 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     slope_of = (duhem_weight.size, 2, -1) if duhem_weight.size > 1 else (-1,)
     own, rate = weight.shape[:-2], np.array(message.fading_rate, dtype=np.float64)
     creep_time = np.array(message.creep_time, dtype=np.float64)
-    count = creep_time.size
     return HysteresisModel(
         radius,
         weight,
@@ -202,10 +213,10 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
         creep_time,
-        _shaped("creep_spectrum", message.creep_spectrum, count, own=True),
+        _shaped("creep_spectrum", message.creep_spectrum, creep_time.size, own=True),
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
-        _shaped("creep_covariance", message.creep_covariance, 2, 1 + count, 1 + count),
+        _shaped("creep_covariance", message.creep_covariance, 2, *(1 + creep_time.size,) * 2),
         _shaped("lag_spectrum", message.lag_spectrum, *own, -1),
         message.creep_slope,
         rate,
@@ -247,10 +258,8 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
 
 
 #: Fields of Recipe that a dm_msgs/Recipe has under the same names.
-_ARRAYS, _NUMBERS = (
-    ("effective", "signals", "zernike", "by_model"),
-    ("curvature", "conic_constant", "max_zernike", "rms", "maps"),
-)
+_ARRAYS = ("effective", "signals", "zernike", "by_model")
+_NUMBERS = ("curvature", "conic_constant", "max_zernike", "rms", "maps")
 
 
 def recipe_book_message(book: RecipeBook, calibration_id: str) -> RecipeBookMsg:

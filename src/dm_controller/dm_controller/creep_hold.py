@@ -76,8 +76,8 @@ class CreepHold:
         order = self._monitor.order
         if order is None or order.command is None or same_signals(requested, order.command.signals):
             return
-        late = now - order.command.sent.steady > CONFIRM_S
-        if order.command.confirmed or (late and not order.fall_back(requested)):  # else a correction was lost
+        due = order.command.confirmed or now - order.command.sent.steady > CONFIRM_S
+        if due and not order.fall_back(requested):  # else a correction was lost, or one that seemed lost has come
             self.end("another command came")
 
     def command(self, estimate: ActuatorEstimate, now: Moment) -> list[SendCommand]:

@@ -15,7 +15,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
-from dm_common.messages import stamp_ns
+from dm_common.messages import driver_refusal, stamp_ns
 from dm_controller.focus_types import Moment, Order, Progress, PublishState
 
 #: States that a driver does not leave by itself, unlike a lost link.
@@ -30,16 +30,6 @@ MOVES = 20
 LATENCY_MAX_S = 1.0
 #: Progress of an order whose shape somebody else has replaced.
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
-
-
-def _not_active(report: ActuatorState) -> Refusal:
-    """The refusal for a driver that takes no commands, with the code that the driver itself would answer."""
-    reason = f": {report.message}" if report.message else ""
-    if report.driver_state == ActuatorState.STATE_LINK_LOST:
-        text = f"pdm_driver has lost the link to the electronics{reason}"
-        return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, text)
-    says_so = report.message and report.driver_state != ActuatorState.STATE_SAFING  # and what to do
-    return Refusal(ErrorCode.DRIVER_INACTIVE, report.message if says_so else f"pdm_driver is not active{reason}")
 
 
 class DriverMonitor:
@@ -147,8 +137,8 @@ class DriverMonitor:
         if report is None:
             text = "no actuator_state from pdm_driver yet: is the driver running?"
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, text)
-        if report.driver_state != ActuatorState.STATE_ACTIVE and not self.loss:
-            return _not_active(report)
+        if (refusal := driver_refusal(report)) is not None and not self.loss:
+            return refusal
         if silent := self.silent(now):
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
         return None
@@ -203,8 +193,8 @@ class DriverMonitor:
         assert self.order is not None and self.order.command is not None  # else nothing keeps a shape
         signals, last = order.move.signals, self.order.command
         report = self.latest
-        if report is not None and report.driver_state != ActuatorState.STATE_ACTIVE:
-            return Progress(failed=_not_active(report))
+        if report is not None and (refusal := driver_refusal(report)) is not None:
+            return Progress(failed=refusal)
         if silent := self.silent(now):
             return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent))
         gap = share = 0.0

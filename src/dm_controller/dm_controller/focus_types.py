@@ -81,7 +81,8 @@ class Order:
         answered: the outcome of its command has been published.
         gap: largest distance of the applied signals from its shape that was reported, normalised.
         command: the last command for its shape; None = none was sent.
-        earlier: the last confirmed command before `command`, which the driver follows until `command` arrives.
+        earlier: the last confirmed command before `command`, which the driver follows until `command` arrives; or one
+            after it that seems to be lost, but may still arrive.
         creep_held: its shape is corrected for creep, from its command until the hold ends.
         checked: s, ROS time, of the last check for creep.
         previous_order: its shape is held until the driver takes the first command of this one; None = none.
@@ -114,11 +115,14 @@ class Order:
         return self.command
 
     def fall_back(self, requested: Sequence[float] | Floats) -> bool:
-        """Take the command before the last one as the present one, if the driver still follows it; return whether."""
-        if self.earlier is None or not same_signals(requested, self.earlier.signals):
+        """Take the other of the last two commands as the present one, if the driver follows it; return whether."""
+        both = self.command, self.earlier
+        if self.earlier is None or all(each is None or each.confirmed for each in both):
             return False
-        self.command = self.earlier
-        return True
+        if followed := same_signals(requested, self.earlier.signals):
+            self.earlier, self.command = both
+            self.command.confirmed = True
+        return followed
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
         """A command to stay at the present signals (N,), which after quantisation may break a limit by a step."""

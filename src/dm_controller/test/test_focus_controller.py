@@ -965,6 +965,23 @@ def test_a_correction_that_is_lost_is_sent_again(timeout: float) -> None:
     assert bench.error(move_of(order).effective) < 1e-4
 
 
+def test_a_correction_that_arrives_late_is_known_again(bench: Bench) -> None:
+    order = bench.ask(0.02)
+    bench.wait(2.0)
+    bench.obeys, sent = False, len(bench.commands)
+    while len(bench.commands) == sent:
+        bench.wait(0.1)
+    correction = bench.commands[sent]
+    bench.wait(1.5)
+    assert len(bench.commands) == sent + 1
+    bench.obeys = True
+    bench.move(correction.signals)
+    assert bench.controller.monitor.progress(order, bench.time).reached
+    bench.wait(3.0)
+    assert bench.controller.hold.active and bench.controller.monitor.progress(order, bench.time).reached
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
 def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) -> None:
     bench.history_known = False
     bench.report()

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
-from dm_common.messages import doubles, measurement_from, stamp_ns
+from dm_common.messages import doubles, driver_refusal, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call, run_goal
 from dm_common.ros.worker import duration_clock, sleep
@@ -108,9 +108,9 @@ class BenchServices:
 
     def check_ready(self) -> None:
         """Raise Refusal when the driver says that it takes no commands."""
-        state = self.state
-        if state is not None and state.driver_state not in (state.STATE_ACTIVE, state.STATE_LINK_LOST):
-            raise Refusal(ErrorCode.DRIVER_INACTIVE, state.message or "pdm_driver is not active: activate it first")
+        refusal = None if self.state is None else driver_refusal(self.state)
+        if refusal is not None and refusal.error_code == ErrorCode.DRIVER_INACTIVE:  # a lost link comes back
+            raise refusal
 
     def check_history(self) -> None:
         """Raise Refusal when the driver knew the history of the actuators and no longer does.

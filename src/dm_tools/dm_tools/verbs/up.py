@@ -146,11 +146,11 @@ def only_suite(namespace: str) -> Iterator[None]:
 def lacks(messages: Mapping[str, Any]) -> str:
     """Why a suite does not take requests yet, by its latest `messages` (by topic); "" = it takes them."""
     from dm_client.connection import RESTING
+    from dm_common.messages import driver_refusal
 
     state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
-    if state is None or state.driver_state != state.STATE_ACTIVE:
-        reason = state.message if state is not None else ""
-        return reason if reason.startswith("pdm_driver") else f"pdm_driver: {reason or 'not active'}"
+    if state is None or (refusal := driver_refusal(state)) is not None:
+        return "pdm_driver is not heard" if state is None else str(refusal)
     if capabilities is not None and capabilities.error_code in RESTING:
         return str(capabilities.message or "focus_controller takes no requests yet")
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
