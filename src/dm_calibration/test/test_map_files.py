@@ -97,6 +97,13 @@ def test_dat_with_a_meaningless_field_is_refused_by_name(tmp_path: Path, fields:
     assert str(tmp_path / "bad.dat") in str(caught.value)
 
 
+@pytest.mark.parametrize("writer", [dat_bytes, asc_bytes])
+def test_a_height_that_no_mirror_has_is_refused(tmp_path: Path, writer: Any) -> None:
+    """A single bit of a damaged file makes a spike of centimetres, as in the formats whose heights are in m."""
+    with pytest.raises(MapFileError, match=r"height = 0 to 0\.0207255 m: must be -0\.001 to 0\.001 m"):
+        read_map(write(tmp_path, "spike", writer(np.array([[0, 0], [0, 0x7FF00000]]))))
+
+
 @pytest.mark.parametrize("change", [-1, -4, 1, 4])
 def test_dat_of_another_length_is_refused(tmp_path: Path, change: int) -> None:
     content = dat_bytes(COUNTS)

@@ -88,6 +88,20 @@ def test_facts_of_a_fits_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("date", "stamp"),
+    [
+        ("2015-04-24T19:34:52Z", 1429904092.0),
+        ("2015-04-24T21:34:52+02:00", 1429904092.0),
+        ("2015-04-24", None),
+        ("yesterday", None),
+        ("0001-01-01T00:00:00", -62135596800.0),
+    ],
+)
+def test_the_date_of_a_fits_file(tmp_path: Path, date: str, stamp: float | None) -> None:
+    assert read_map(write(tmp_path, "a.fits", fits_bytes(SAG, **{"DATE-OBS": date}))).time_stamp == stamp
+
+
+@pytest.mark.parametrize(
     ("cards", "words"),
     [
         ({"BUNIT": None}, "BUNIT is missing: the values have no unit"),

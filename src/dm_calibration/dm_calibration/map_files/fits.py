@@ -166,8 +166,9 @@ def _pitch(header: Header) -> float | None:
 
 
 def _time(text: str) -> float | None:
-    """s since the epoch, of a DATE-OBS in UTC; None = not given, no time, or without a time of day."""
+    """s since the epoch, of a DATE-OBS, in UTC unless it states an offset; None = none, or without a time of day."""
     try:
-        return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp() if "T" in text else None
+        time = datetime.fromisoformat(text)
     except ValueError:
         return None
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() if "T" in text else None

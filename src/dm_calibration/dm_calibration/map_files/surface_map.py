@@ -183,7 +183,7 @@ def check_heights(sag: Floats) -> None:
     """
     lowest, highest = float(np.fmin.reduce(sag, axis=None)), float(np.fmax.reduce(sag, axis=None))
     if math.isnan(lowest):
-        raise _no_valid_pixels(sag.shape)
+        raise NoValidPixelsError(f"none of the {sag.shape[1]} x {sag.shape[0]} pixels is valid: the map holds no data")
     if max(-lowest, highest) > HEIGHT_MAX:
         raise _outside("height", f"{lowest:g} to {highest:g} m", f"-{HEIGHT_MAX:g} to {HEIGHT_MAX:g} m")
 
@@ -195,8 +195,8 @@ def sag_from_counts(counts: NDArray[np.integer], header: Mapping[str, Any]) -> F
     double-pass fringes into surface height.
 
     Raises:
-        MapFileError: a factor that makes heights meaningless (0, NaN, absurd) or a code of unknown meaning.
-        NoValidPixelsError: every pixel is invalid.
+        MapFileError: a factor that makes heights meaningless (0, NaN, absurd) or a code of unknown meaning; or as
+            :func:`check_heights`.
     """
     scale_factor = check_factor("interferometric scale factor", header["scale_factor"])
     obliquity = check_factor("obliquity factor", header["obliquity"])
@@ -207,11 +207,9 @@ def sag_from_counts(counts: NDArray[np.integer], header: Mapping[str, Any]) -> F
         raise _outside("data sign", header["data_sign"], "0 (normal) or 1 (inverted)")
     sign = -1.0 if header["data_sign"] == 1 else 1.0
     metres_per_count = sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[header["phase_resolution"]]
-    invalid = counts >= INVALID_COUNTS
-    if invalid.all():
-        raise _no_valid_pixels(counts.shape)
     sag = np.asarray(counts * metres_per_count, dtype=np.float64)
-    sag[invalid] = math.nan
+    sag[counts >= INVALID_COUNTS] = math.nan
+    check_heights(sag)
     return sag
 
 
@@ -228,7 +226,3 @@ def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str)
         time_stamp=float(header["time_stamp"]) if header["time_stamp"] > 0 else None,
         system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
     )
-
-
-def _no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:
-    return NoValidPixelsError(f"none of the {shape[1]} x {shape[0]} pixels is valid: the map holds no data")
