@@ -17,7 +17,7 @@ from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.check_log import read_checks
+from dm_calibration.recalibration.check_log import append_check, read_checks
 from dm_calibration.recalibration.displaced import described
 from dm_calibration.recalibration.drift import Displaced, Drift, UpdateOptions
 from dm_calibration.recalibration.map_listener import MapListener
@@ -638,6 +638,13 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
         updates.take(bench.measure("bad"), bench.settled())
         assert len(read_checks(file)) == taken
     assert read_checks(tmp_path / "none.csv") == []
+    with file.open("r+b") as stream:  # the log of many years is not read to add a line to it; a sparse file
+        stream.truncate(2**40)
+    append_check(file, good)
+    with file.open("rb") as stream:
+        stream.seek(2**40)
+        assert stream.read().startswith(b"\r\n") and stream.tell() < 2**40 + 300
+    file.unlink()
 
 
 def test_what_a_map_shows_while_the_message_is_made_is_published_too(

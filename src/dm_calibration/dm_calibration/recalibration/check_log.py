@@ -4,6 +4,7 @@ import csv
 import math
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,9 +47,9 @@ class Check:
 
 def append_check(file: Path, check: Check) -> None:
     """Add a line to the log. Raises OSError."""
-    end = file.read_bytes()[-1:] if file.exists() else b""
-    with file.open("a", newline="") as stream:
-        writer = csv.writer(stream)
+    with file.open("ab+") as log, TextIOWrapper(log, newline="") as stream:
+        log.seek(max(log.tell() - 1, 0))
+        end, writer = log.read(), csv.writer(stream)
         if not end:
             writer.writerow(item.name for item in fields(Check))
         elif end != b"\n":  # a power cut has torn the last line
@@ -65,8 +66,7 @@ def read_checks(file: Path) -> list[Check]:
         return []
     kinds: list[Any] = [item.type for item in fields(Check)]
     for line in lines[1:]:
-        with suppress(ValueError, csv.Error):
-            (row,) = csv.reader([line])
-            check = Check(*(kind(value) for kind, value in zip(kinds, row, strict=True)))
-            found += [check] if all(map(math.isfinite, astuple(check))) else []
+        with suppress(ValueError):
+            values = [kind(value) for kind, value in zip(kinds, line.split(","), strict=True)]
+            found += [Check(*values)] if all(map(math.isfinite, values)) else []
     return sorted(found, key=lambda check: check.time)
