@@ -230,6 +230,26 @@ def test_an_actuator_that_stands_where_it_should_is_not_given_up(
     assert known(updates).revision == 0 and not known(updates).given_up
 
 
+def test_an_actuator_is_not_given_up_at_a_place_that_none_reaches(
+    bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    settled, beyond = bench.settled(), bench.signals.copy()
+    beyond[6] = 1.6
+    bench.apply(beyond)
+    with pytest.raises(MapNotUsableError, match=r"actuator 7 stands at \+1\.60 \+- 0\.00, none beyond 1\.5: the map"):
+        updates.take(bench.measure("dust"), settled, without=[6])
+
+
+def test_the_last_actuator_is_not_given_up(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    """Nothing could be planned without any."""
+    settled, count = bench.settled(), bench.mirror.actuators
+    bench.apply(np.where(np.arange(count) == 6, bench.signals, 0.9))
+    assert updates.take(bench.measure("all but one"), settled, without=[k for k in range(count) if k != 6]).accepted
+    bench.apply(np.full(count, 0.9))
+    with pytest.raises(MapNotUsableError, match="no actuator that responds would be left: calibrate anew"):
+        updates.take(bench.measure("the last"), settled, without=[6])
+
+
 def test_what_was_given_up_creeps_on_inside_the_bound(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
     updates, settled = begun(made, tmp_path), bench.settled()
     fallen = bench.signals.copy()

@@ -9,6 +9,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.quality import NO_RESPONSE
 from dm_calibration.influence.registration import bumps
+from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.drift import Displaced
 from dm_common import Bools, Floats
 from dm_common.geometry import pitch
@@ -28,6 +29,8 @@ DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
 #: displacements of up to 0.03; and at which it is named where the map agrees.
 FAILED_SIGNAL, NOTICED = 0.05, 0.01
+#: An actuator counts as failed beyond this many standard deviations from where it should stand.
+DISPLACED_SIGMAS = 4.0
 #: No actuator stands at an effective signal beyond this.
 FURTHEST = 1.5
 #: From data sheets of piezo mirrors: rise of the surface over an actuator per unit signal, m, and width of the bump
@@ -120,16 +123,32 @@ def _deviance(square: Floats, size: int) -> Floats:
     return np.where(square > size, size * (1.0 + np.log(np.maximum(square, size) / size)), square)
 
 
-def displacement(
-    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], actuators: list[int]
-) -> tuple[Floats, Floats]:
-    """Displacement of each of `actuators` from its expected position, in effective signal, and its standard deviation.
+def given_up_at(
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], actuators: list[int], expected: Floats, moving: Bools
+) -> Floats:
+    """Where a map shows each of `actuators`, in effective signal, by generalised least squares.
 
-    By generalised least squares; other args as those of :func:`displaced_actuators`.
+    Args:
+        innovation, gain, factor: as of :func:`displaced_actuators`.
+        expected: (N,) where actuators should stand.
+        moving: (N,) which were not given up before.
+
+    Raises:
+        MapNotUsableError: an actuator stands where it should, within the error of the map, or where none can.
     """
     white = solve_triangular(factor[0], np.column_stack((gain[:, actuators], innovation)), trans="T")
     inverse = np.linalg.pinv(white[:, :-1])
-    return np.asarray(inverse @ white[:, -1]), np.sqrt(np.square(inverse).sum(axis=1))
+    away, sigma = inverse @ white[:, -1], np.sqrt(np.square(inverse).sum(axis=1))
+    for actuator, more, error in zip(actuators, away, sigma, strict=True):
+        place = f"actuator {actuator + 1} stands at {expected[actuator] + more:+.2f} +- {error:.2f}"
+        if moving[actuator] and abs(more) <= DISPLACED_SIGMAS * error:
+            raise MapNotUsableError(
+                f"{place}, expected at {expected[actuator]:+.2f}: this shape does not show that it fails; ask for "
+                "another first"
+            )
+        if abs(expected[actuator] + more) > FURTHEST:
+            raise MapNotUsableError(f"{place}, none beyond {FURTHEST:g}: the map shows another fault")
+    return np.asarray(expected[actuators] + away)
 
 
 def described(displaced: Mapping[int, Displaced], expected: Floats, given_up: Bools, silent: Bools) -> str:

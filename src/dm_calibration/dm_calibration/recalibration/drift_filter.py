@@ -30,7 +30,7 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.displaced import displaced_actuators, displacement, visible_gain, without_response
+from dm_calibration.recalibration.displaced import displaced_actuators, given_up_at, visible_gain, without_response
 from dm_calibration.recalibration.drift import WARM_FIGURE, WARM_GAIN, Comparison, Drift, UpdateOptions, surprise_of
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import slow_creep
@@ -45,8 +45,6 @@ DAY_S = 86400.0
 NOISE_SHARE_MIN, NOISE_MIN = 0.1, 1e-24
 #: Factor on earlier evidence for each further map: evidence covers about the last thirty maps.
 EVIDENCE_KEPT = 0.97
-#: An actuator counts as failed beyond this many standard deviations from where it should stand.
-DISPLACED_SIGMAS = 4.0
 GAIN_SIGMA_MAX = 0.05  # largest relative standard deviation of a gain, even of actuators with little response
 #: Decades of time for which a stuck actuator creeps on, as after a move across the range: with the factor on every
 #: bound (1.4), and a map some ten seconds after it failed, that covers about two hours.
@@ -192,19 +190,15 @@ class DriftFilter:
         Args as of :meth:`compare`.
 
         Raises:
-            MapNotUsableError: an actuator stands where it should, within the error of the map.
+            MapNotUsableError: see :func:`given_up_at`; or no actuator that responds is left.
         """
         seen = self._innovation(self._at(drift, measured.stamp_ns), measured, effective, repeat)
-        away, sigma = displacement(seen.shown - seen.predicted - seen.warm, self._gain, seen.factor, actuators)
-        at = drift.reached(effective)
+        innovation = seen.shown - seen.predicted - seen.warm
+        moving, at = np.isnan(drift.stuck), drift.reached(effective)
         stuck = drift.stuck.copy()
-        for actuator, more, error in zip(actuators, away, sigma, strict=True):
-            if np.isnan(stuck[actuator]) and abs(more) <= DISPLACED_SIGMAS * error:
-                raise MapNotUsableError(
-                    f"actuator {actuator + 1} stands at {at[actuator] + more:+.2f} +- {error:.2f}, expected at "
-                    f"{at[actuator]:+.2f}: this shape does not show that it fails; ask for another first"
-                )
-            stuck[actuator] = at[actuator] + more
+        stuck[actuators] = given_up_at(innovation, self._gain, seen.factor, actuators, at, moving)
+        if (np.isfinite(stuck) | self._silent).all():
+            raise MapNotUsableError("no actuator that responds would be left: calibrate anew")
         return replace(drift, stuck=stuck)
 
     def _at(self, drift: Drift, stamp_ns: int) -> Drift:
