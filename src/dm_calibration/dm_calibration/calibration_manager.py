@@ -212,7 +212,8 @@ class CalibrationManager:
             if count != has:
                 text = f"effective has {count} values: calibration {before.id} has {has} actuators"
                 raise Refusal(ErrorCode.INVALID_LENGTH, text)
-            after = replace(before, recipes=before.recipes.merged(book))
+            # Those in the file: another node that shares the folder may have added some.
+            after = replace(before, recipes=self.store.load(before.id).recipes.merged(book))
             self.store.replace(after)
             with self._lock:
                 self._checked_in_use(calibration_id)

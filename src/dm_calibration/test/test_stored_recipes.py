@@ -110,6 +110,15 @@ def test_recipes_join_the_calibration_and_its_file(rig: Rig) -> None:
     assert len(rig.published[-1].recipes.recipes) == 3
 
 
+def test_recipes_that_another_node_has_added_to_the_file_stay(rig: Rig) -> None:
+    other = CalibrationManager(CalibrationStore(rig.store.folder), lambda: 0.01, lambda: 0, lambda _one, _file: None)
+    other.set_mirror(MIRROR)
+    other.load("known")
+    other.add_recipes("known", book(0.01))
+    rig.manager.add_recipes("known", book(0.02))
+    assert [recipe.curvature for recipe in rig.store.load("known").recipes.recipes] == [0.01, 0.02]
+
+
 def test_what_comes_after_a_cleanup_is_not_used(rig: Rig) -> None:
     rig.resting = "calibration is not active"
     rig.manager.use(None)
