@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import scipy.stats
 from dm_msgs.msg import Capabilities
+from reportlab.pdfbase.pdfmetrics import stringWidth
+from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import LongTable, Paragraph
 from scipy.optimize import linprog
 from scipy.stats import theilslopes
@@ -35,7 +37,7 @@ from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content_fit import residuals
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
-from dm_calibration.report.figures import on_disc
+from dm_calibration.report.figures import on_disc, response_figure
 from dm_calibration.report.html_page import html_page
 from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
@@ -91,6 +93,23 @@ def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
     ]
     assert "<td>actuators</td><td>19 good</td>" in text
     assert pdf.stat().st_size > 10_000
+
+
+def test_the_axis_of_a_single_actuator_numbers_it() -> None:
+    mirror = make_mirror(rings=0)
+    outcome = Procedure(make_plan(PlanKind.POKES, mirror), mirror, lagging_bench(mirror)).run()
+    one = calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance("one", 10**18))
+    np.testing.assert_array_equal(np.mod(response_figure(one).axes[0].get_xticks(), 1.0), 0.0)
+
+
+def test_a_text_longer_than_a_page_is_printed_and_a_long_title_ends_before_the_page_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    feet = list[str]()
+    monkeypatch.setattr(Canvas, "drawString", lambda _canvas, _x, _y, text: feet.append(text))
+    table = Table("Provenance", ("item", "value"), [("note", "word " * 2000)], textual=True)
+    assert pdf_pages("A mirror with a name " * 20, [Section("What was measured", [], [table])]).startswith(b"%PDF")
+    assert len(feet) > 1 and all(stringWidth(foot, "DejaVuSans", 7.0) < 430.0 for foot in feet)
 
 
 def test_the_page_is_one_file(page: str) -> None:

@@ -97,7 +97,7 @@ def response_figure(calibration: Calibration) -> Figure:
             left.bar(numbers[chosen], fit.response[chosen] * NM, color=colour, label=label)
     left.errorbar(numbers, fit.response * NM, fit.standard_error * NM, fmt="none", ecolor="black", elinewidth=0.8)
     left.set(xlabel="actuator", ylabel="rms sag of a unit signal, nm")
-    left.xaxis.set_major_locator(MaxNLocator(integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     left.legend(fontsize=8)
     left.grid(axis="y", alpha=0.3)
     x, y = calibration.actuator_x * MM, calibration.actuator_y * MM

@@ -14,6 +14,7 @@ from reportlab.lib.colors import HexColor
 from reportlab.lib.enums import TA_LEFT, TA_RIGHT
 from reportlab.lib.pagesizes import A4
 from reportlab.lib.styles import ParagraphStyle
+from reportlab.lib.utils import simpleSplit
 from reportlab.pdfbase import pdfmetrics
 from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.pdfgen.canvas import Canvas
@@ -44,6 +45,8 @@ PADDING = 4.0
 #: Largest width of a column, as a share of the page, before its text is broken over lines.
 COLUMN_MAX = 0.38
 TABLE_SIZE = 8.0
+#: Room for the number at the foot of a page.
+NUMBER = 70.0
 FOOT = HexColor("#444444")
 RULE = HexColor("#dddddd")
 #: The fonts of the figures: they have the Greek letters and symbols of the text, which the standard PDF fonts lack.
@@ -132,7 +135,8 @@ def _table(table: Table) -> list[Flowable]:
             ("LINEBELOW", (0, 1), (-1, -1), 0.3, RULE),
         ]
     )
-    made = LongTable(rows, colWidths=[scale * width for width in widths], repeatRows=1, style=style, hAlign="LEFT")
+    scaled = [scale * width for width in widths]
+    made = LongTable(rows, colWidths=scaled, repeatRows=1, splitInRow=1, style=style, hAlign="LEFT")
     return [_paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)]
 
 
@@ -175,7 +179,8 @@ def _numbered(title: str) -> type[Canvas]:
                 self.__dict__.update(page)
                 self.setFont(REGULAR, 7.0)
                 self.setFillColor(FOOT)
-                self.drawString(MARGIN, 0.5 * MARGIN, title)
+                shown = "".join(simpleSplit(title, REGULAR, 7.0, WIDTH - NUMBER)[:1])
+                self.drawString(MARGIN, 0.5 * MARGIN, shown)
                 self.drawRightString(A4[0] - MARGIN, 0.5 * MARGIN, f"page {number} of {len(self._finished)}")
                 super().showPage()
             super().save()
