@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,13 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from dm_msgs.msg import Capabilities
+from dm_msgs.msg import Capabilities, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_DEAD
-from dm_calibration.procedure.applied_history import MapNotUsableError
+from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_calibration.recalibration.check_log import append_check, read_checks
 from dm_calibration.recalibration.displaced import described
 from dm_calibration.recalibration.drift import Displaced, Drift, UpdateOptions
@@ -686,6 +690,33 @@ def test_what_a_map_shows_while_the_message_is_made_is_published_too(
     monkeypatch.setattr(MapListener, "_doubts", lambda _listener: [])
     listener.amend(calibration_message(in_use(updates).calibration, None, "mirror", 1.0))
     assert listener._dirty
+
+
+def test_maps_do_not_queue_up_while_the_driver_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten a second for a night filled the memory, and the newest was judged hours late."""
+    listener = cast(Any, MapListener.__new__(MapListener))
+    monkeypatch.setattr("dm_calibration.recalibration.map_listener.REPORT_WAIT_S", 0.5)
+    log = SimpleNamespace(info=lambda _text, **_options: None)
+    listener._node = SimpleNamespace(active=True, get_logger=lambda: log)
+    listener._values = {"updates.enable": True, "updates.still_time": 0.1}
+    listener._updates, listener._busy = SimpleNamespace(in_use=True), lambda: False
+    listener._temperatures, listener._refused = SimpleNamespace(at=lambda _time: np.nan), 0
+    listener._incomplete, listener._compared, listener._turn = {}, deque(maxlen=64), threading.Lock()
+    listener.history, listener._worker = AppliedHistory(), ThreadPoolExecutor(1)
+    values = np.ones(3)
+    for stamp in range(1, 21):
+        parts = {
+            "zernike": ZernikeCoefficients(coefficients=stamp * np.ones(21)),
+            "samples": SurfaceSamples(x=values, y=values, weight=values, sag=values),
+            "info": SurfaceMapInfo(),
+        }
+        for name, message in parts.items():
+            message.header.stamp.sec = stamp
+            listener._on_part(name, message)
+    began = time.monotonic()
+    listener._worker.shutdown()
+    assert listener._refused == 20 and "has not reported" in listener._last_refusal
+    assert 0.4 < time.monotonic() - began < 3.0
 
 
 def test_a_wide_gap_of_a_mirror_that_is_well_is_no_surprise(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:

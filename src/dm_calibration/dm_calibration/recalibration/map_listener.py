@@ -163,18 +163,18 @@ class MapListener:
         stamp = stamp_ns(message.header.stamp)
         self._incomplete.setdefault(stamp, {})[name] = message
         if len(self._incomplete[stamp]) == 3:
-            self._worker.submit(self._on_map, Measure.Response(**self._incomplete.pop(stamp)))
+            self._worker.submit(self._on_map, Measure.Response(**self._incomplete.pop(stamp)), time.monotonic())
         while len(self._incomplete) > INCOMPLETE_KEPT:
             del self._incomplete[next(iter(self._incomplete))]
 
-    def _on_map(self, answer: Measure.Response) -> None:
-        """A map that came over the topics; runs in the worker thread."""
+    def _on_map(self, answer: Measure.Response, arrived: float) -> None:
+        """A map that came over the topics at the monotonic time `arrived` (s); runs in the worker thread."""
         log = self._node.get_logger()
         try:
             with self._turn:
                 measured = measurement_from(answer)
                 if not any(measured.same_map(before) for before in self._compared):
-                    self._compare(measured, dry_run=False)
+                    self._compare(measured, arrived, dry_run=False)
         except EXPECTED as error:
             self._refuse(str(error))
             log.info(f"map not used: {error}", throttle_duration_sec=10.0)
@@ -182,10 +182,11 @@ class MapListener:
             self._refuse(f"{type(error).__name__}: {error}")
             log.error(f"map not used: {type(error).__name__}: {error}")
 
-    def _compare(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
+    def _compare(self, measured: Measurement, arrived: float, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
         """Compare a map with the calibration, and update it if they agree; `_turn` must be held.
 
-        Args as of :meth:`RecalibrationManager.take`.
+        The wait for the driver counts from when the map arrived: while it is silent, maps do not queue up. Other args
+        as of :meth:`RecalibrationManager.take`.
 
         Raises:
             Refusal: a calibration is running, or the driver is silent.
@@ -195,7 +196,8 @@ class MapListener:
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
         measured = replace(measured, temperature=self._temperatures.at(at))
-        if not wait_until(lambda: self.history.heard_since(at + still), REPORT_WAIT_S + still):
+        wait_s = arrived + REPORT_WAIT_S + still - time.monotonic()
+        if not wait_until(lambda: self.history.heard_since(at + still), wait_s):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
@@ -254,7 +256,8 @@ class MapListener:
                 wait_until(self._is_at_rest, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_present_shape("calibration check")
                 try:
-                    verdict = self._compare(measured, request.dry_run, [number - 1 for number in request.without])
+                    without = [number - 1 for number in request.without]
+                    verdict = self._compare(measured, time.monotonic(), request.dry_run, without)
                 except MapNotUsableError as error:
                     if not request.dry_run:
                         self._refuse(str(error))
