@@ -79,7 +79,8 @@ def put_updates(
         setattr(message, name, doubles(getattr(fit, name)))
     errors = kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)
     for promise in (message, message.hysteresis):  # no bound falls below the disagreement of maps since one last agreed
-        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, drift.disagreement), *errors)
+        held_out = math.sqrt(drift.excess) * promise.held_out_max_zernike
+        promise.held_out_max_zernike = math.hypot(max(held_out, drift.disagreement), *errors)
     message.revision = drift.revision
     message.checked = time_message(drift.checked_ns)
     message.creep_shown = drift.trust

@@ -202,6 +202,11 @@ def worst_other_error(displaced: Mapping[int, Displaced], expected: Floats, zern
     return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
 
 
+def noticed(one: Displaced) -> bool:
+    """Whether an actuator is surely somewhere else, if only so little that the map agrees."""
+    return one.probability >= SURE and abs(one.more) >= NOTICED
+
+
 def failed(one: Displaced) -> bool:
     """Whether an actuator is surely, and far enough, from where it should stand to have failed."""
     return one.probability >= SURE and abs(one.more) >= FAILED_SIGNAL

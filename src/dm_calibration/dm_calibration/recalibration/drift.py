@@ -16,6 +16,9 @@ from dm_common.values import live_parameter, parameter, real, whole
 #: gains, and change of the figure, m rms.
 WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 
+#: Mean square of the surprise of a few maps that may be due to chance.
+MISFIT_BY_CHANCE = 1.5
+
 
 @dataclass(frozen=True)
 class UpdateOptions:
@@ -62,7 +65,9 @@ class Drift:
         revision: number of maps used.
         checked_ns: latest stamp of these; 0 = none.
         surprising: number of the latest maps, in a row, that disagreed.
-        disagreement: largest error (m) in these maps, or in other shapes by the faulty actuators that they show.
+        disagreement: largest error (m) in these maps, or in other shapes by the faulty actuators that they show; if the
+            last map agreed, that by actuators that may begin to fail.
+        misfit: mean square of the surprise of maps that agreed, in which the last ones count most; 1 = as expected.
         evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and sum of their
             products with the measured changes; first row: gain and figure, second row: changes by temperature.
         stuck: (N,) effective signals at which actuators are stuck; NaN = the actuator moves.
@@ -82,11 +87,17 @@ class Drift:
     checked_ns: int = 0
     surprising: int = 0
     disagreement: float = 0.0
+    misfit: float = 1.0
 
     @property
     def trust(self) -> float:
         """Share of the estimated gain and offset that maps not used for the estimate have confirmed, 0 to 1."""
         return _share(*self.evidence[0])
+
+    @property
+    def excess(self) -> float:
+        """Factor by which the last maps differ more than expected and by more than chance (mean square), at least 1."""
+        return max(1.0, self.misfit / MISFIT_BY_CHANCE)
 
     @property
     def thermal_trust(self) -> float:

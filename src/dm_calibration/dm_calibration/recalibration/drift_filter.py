@@ -45,6 +45,8 @@ DAY_S = 86400.0
 NOISE_SHARE_MIN, NOISE_MIN = 0.1, 1e-24
 #: Factor on earlier evidence for each further map: evidence covers about the last thirty maps.
 EVIDENCE_KEPT = 0.97
+#: The same for the mean square of surprises, which covers about the last four maps.
+MISFIT_KEPT = 0.75
 GAIN_SIGMA_MAX = 0.05  # largest relative standard deviation of a gain, even of actuators with little response
 #: Decades of time for which a stuck actuator creeps on, as after a move across the range: with the factor on every
 #: bound (1.4), and a map some ten seconds after it failed, that covers about two hours.
@@ -148,12 +150,14 @@ class DriftFilter:
         left = np.eye(len(prior)) - kalman @ design
         noise = seen.expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
-        evidence = drift.evidence.copy()
+        evidence, misfit = drift.evidence.copy(), drift.misfit
+        surprise = surprise_of(innovation, seen.expected, factor)
         if not repeat:  # a repeat shares the error of the law with the map before it
             weighed, warm = cho_solve(factor, seen.predicted), cho_solve(factor, seen.warm)
             rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.predicted
             evidence[0] *= EVIDENCE_KEPT
             evidence[1] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map not warmer is no evidence
+            misfit = MISFIT_KEPT * misfit + (1.0 - MISFIT_KEPT) * surprise**2
             evidence += (weighed @ seen.predicted, weighed @ rest[0]), (warm @ seen.warm, warm @ rest[1])
         known = np.append(drift.temperatures, measured.temperature)
         updated = replace(
@@ -168,6 +172,7 @@ class DriftFilter:
             checked_ns=max(measured.stamp_ns, drift.checked_ns),
             surprising=0,
             disagreement=0.0,
+            misfit=misfit,
             evidence=evidence,
             temperatures=np.array(
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
@@ -177,7 +182,7 @@ class DriftFilter:
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
-            surprise=surprise_of(innovation, seen.expected, factor),
+            surprise=surprise,
             updated=updated,
             displaced=displaced_actuators(innovation, self._visible, factor, self._silent, self.reduction.coefficients),
         )
@@ -209,7 +214,8 @@ class DriftFilter:
         fade = np.ones(len(drift.covariance))
         creep = slice(-self.reduction.size, None)
         fade[creep] = kept
-        covariance = drift.covariance * np.outer(fade, fade) + elapsed / DAY_S * self._growth
+        # Drift is only a part of what maps differ by: to account for the excess it must have grown by more than that.
+        covariance = drift.covariance * np.outer(fade, fade) + drift.excess**2 * elapsed / DAY_S * self._growth
         covariance[creep, creep] += grown**2 * self._unit
         return replace(drift, crept=kept * drift.crept, covariance=covariance)
 

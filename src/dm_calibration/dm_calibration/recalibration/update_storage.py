@@ -20,7 +20,8 @@ _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Figures missing in older files, with values that give a trust of exactly 1, with which those updates were used.
-_FIGURES = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0, "disagreement": 0.0}
+_EVIDENCE = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0}
+_FIGURES = {"disagreement": 0.0, "misfit": 1.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
@@ -48,8 +49,8 @@ def write_updates(path: Path, calibration: Calibration, updates: Drift) -> None:
     columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, *_OR_NAN)}
     attributes: dict[str, Attribute] = {
         **_head(calibration),
-        **{name: getattr(updates, name) for name in _NUMBERS},
-        **dict(zip(_FIGURES, (*updates.evidence.ravel().tolist(), updates.disagreement), strict=True)),
+        **{name: getattr(updates, name) for name in (*_NUMBERS, *_FIGURES)},
+        **dict(zip(_EVIDENCE, updates.evidence.ravel().tolist(), strict=True)),
     }
     write_whole(path, write_image(columns, attributes))
 
@@ -90,9 +91,10 @@ def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | N
         right = isinstance(value, np.ndarray) and value.shape == shape and np.isfinite(value) | (nan & np.isnan(value))
         if not np.all(right):
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} {allowed}")
-    figures = {name: attributes.get(name, before) for name, before in _FIGURES.items()}
+    figures = {name: attributes.get(name, before) for name, before in (_EVIDENCE | _FIGURES).items()}
     for name, number in figures.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers, "disagreement": figures.pop("disagreement")}
-    return Drift(**found, evidence=np.reshape(list(figures.values()), (2, 2)))
+    evidence = np.reshape([figures.pop(name) for name in _EVIDENCE], (2, 2))
+    found: dict[str, Any] = {**arrays, **numbers, **figures}
+    return Drift(**found, evidence=evidence)

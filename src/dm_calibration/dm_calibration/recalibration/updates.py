@@ -17,13 +17,14 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_comparison import other_aperture, other_setup
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import NOTICED, SURE, described, without_response, worst_other_error
+from dm_calibration.recalibration.displaced import described, noticed, without_response, worst_other_error
 from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
 from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.measurement import Measurement
+from dm_common.optics.zernike import PISTON_TILT
 
 #: Time within which all maps of a mirror that has not moved share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
@@ -103,8 +104,10 @@ class RecalibrationManager:
 
     @property
     def widened(self) -> list[str]:
-        """A sentence if disagreeing maps widen the bounds but are too few to doubt the calibration."""
+        """A sentence if maps widen the bounds but leave no doubt of the calibration."""
         surprising = 0 if (kept := self.in_use) is None else kept.drift.surprising
+        if kept is not None and not surprising and kept.drift.disagreement:
+            return ["The last map shows an actuator that may begin to fail: bounds are wider until one does not."]
         if not 0 < surprising < self._options().surprises_max:
             return []
         last = "map disagrees" if surprising == 1 else f"{surprising} maps disagree"
@@ -162,14 +165,18 @@ class RecalibrationManager:
             causes = described(*found, np.isfinite(kept.drift.stuck), without_response(calibration))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: {causes}"
-            elif any(one.probability >= SURE and abs(one.more) >= NOTICED for one in comparison.displaced.values()):
+            elif any(map(noticed, comparison.displaced.values())):
                 reason += f"; {causes}"
             if accepted and without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
             if accepted:
-                changed, kept = comparison.updated, replace(kept, repeats=repeat + 1)
+                # An actuator that begins to fail is likely to err as much in other shapes.
+                away = {index: abs(one.more) for index, one in comparison.displaced.items() if noticed(one)}
+                effects = np.abs(calibration.fit.influence_zernike[PISTON_TILT:, list(away)]) @ list(away.values())
+                changed = replace(comparison.updated, disagreement=float(effects.max()))
+                kept = replace(kept, repeats=repeat + 1)
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
             else:
