@@ -8,6 +8,7 @@ whose actuators are alike keeps its common law.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -109,73 +110,109 @@ def identify(
     quiet = check_excitation(run)
     usable = run.responses.usable
     test = np.zeros_like(usable) if test is None else test & usable
-    early = bool(test[: len(test) // 2].any())
-    train = usable & ~test
-    scatter = _scatter(run, train)
-    part = np.zeros(len(usable), dtype=int)
-    part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
-    best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
-    common: list[tuple[float, LawFit]] = []  # own laws may start from those with Duhem operators, even if refused
-    scores: dict[str, float] = {}
-    refused: dict[str, str] = {}
-    residuals: list[Floats] = []
-
-    def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
-        nonlocal best
-        name = problem.candidate.name
-        whole = whole or problem.fit(train)
-        residuals.append(whole.residual)
-        if flat := _too_flat(run, whole, slope_min):
-            refused[name] = flat
-            if not whole.candidate.own and whole.candidate.slopes:
-                common.append((np.inf, whole))
-            return
-        if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
-            refused[name] = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not determine its creep"
-            return
-        gain = _size(run, best[2].residual[train]) / _size(run, whole.residual[train]) if best else np.inf
-        if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
-            scores[name] = best[0]  # it hardly fits its own maps better, so it will not predict better
-        else:
-            held_out = np.full_like(whole.residual, np.nan)
-            for fold in range(folds):
-                left_out = train & (part == fold)
-                held_out[left_out] = problem.fit(train & ~left_out, whole).residual[left_out]
-            scores[name] = _size(run, held_out[train])
-            if best is None or PARSIMONY * scores[name] < best[0]:
-                best = (scores[name], problem, whole, held_out)
-        refused.pop(name, None)
-        if not whole.candidate.own:
-            common.append((scores[name], whole))
-
+    choice = _Choice(run, usable & ~test, folds, blocks, slope_min)
+    scatter = _scatter(run, choice.train)
     for candidate in candidates:
         if not candidate.own:
-            consider(CandidateProblem(run, candidate, scatter))
-        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
-            common.sort(key=lambda scored: scored[0])
-            starts = [fit for _, fit in common if fit.candidate.kind == candidate.kind]
-            for own, whole in _own_law_fits(run, candidate, starts, scatter, train, slope_min):
-                consider(own, whole)
-                if candidate.name not in refused:
+            choice.consider(CandidateProblem(run, candidate, scatter))
+        elif choice.best is not None and choice.best.problem.candidate.hysteretic == candidate.hysteretic:
+            starts = choice.common_laws(candidate.kind)
+            for own, whole in _own_law_fits(run, candidate, starts, scatter, choice.train, slope_min):
+                choice.consider(own, whole)
+                if candidate.name not in choice.refused:
                     break
+    best = choice.best
     assert best is not None  # the linear candidate can always be inverted
-    score, problem, fitted, held_out = best
-    if test.any():
-        held_out = np.where(test[:, None], fitted.residual, np.nan)
-        if early or train.sum() < FEW * run.signals.shape[1]:
-            half = 2 * np.cumsum(test) > test.sum()
-            for left_out in (test & half, test & ~half):
-                if left_out.any():
-                    held_out[left_out] = problem.fit(usable & ~left_out, fitted).residual[left_out]
-        whole = problem.fit(usable, fitted)
-        if flat := _too_flat(run, whole, slope_min):
-            refused["the fit that includes the test moves"] = flat
-            held_out = np.where(test[:, None], fitted.residual, np.nan)
+    fit, held_out = _with_tests(run, test, best, choice) if test.any() else (best.whole, best.held_out)
+    residuals = (*choice.residuals, fit.residual)
+    closest = min(residuals, key=lambda left: np.median(np.linalg.norm(left[usable], axis=1)))
+    scores = {name: score / best.score for name, score in choice.scores.items()}
+    return Identification(fit, held_out, closest, scores, choice.refused, quiet)
+
+
+class _Tried(NamedTuple):
+    """A candidate's fit to all maps of the choice, `held_out` (M, D) residual of each part of the run, and its rms."""
+
+    score: float
+    problem: CandidateProblem | OwnLaws
+    whole: LawFit
+    held_out: Floats
+
+
+class _Choice:
+    """The candidates tried so far, and the best of them.
+
+    Args:
+        train: (M,) maps by which they are compared.
+
+    Attributes:
+        best: None before the first that can be inverted.
+        scores, refused: as in Identification, the scores in m rms.
+        residuals: (M, D) residual of each.
+    """
+
+    def __init__(self, run: Run, train: Bools, folds: int, blocks: int, slope_min: float) -> None:
+        self._run, self.train, self.slope_min = run, train, slope_min
+        part = np.full(len(train), -1)
+        part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
+        self._parts = [part == fold for fold in range(folds)]
+        self.best: _Tried | None = None
+        self._common: list[tuple[float, LawFit]] = []
+        self.scores: dict[str, float] = {}
+        self.refused: dict[str, str] = {}
+        self.residuals: list[Floats] = []
+
+    def common_laws(self, kind: tuple[bool, bool]) -> list[LawFit]:
+        """Laws common to all actuators of this kind, the best first; those with Duhem operators even if refused."""
+        return [fit for _, fit in sorted(self._common, key=lambda tried: tried[0]) if fit.candidate.kind == kind]
+
+    def consider(self, problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
+        """Try the candidate of `problem`; `whole` is its fit to all of `train`, if that is known already."""
+        name, train, best = problem.candidate.name, self.train, self.best
+        whole = whole or problem.fit(train)
+        self.residuals.append(whole.residual)
+        if flat := _too_flat(self._run, whole, self.slope_min):
+            self.refused[name] = flat
+            if not whole.candidate.own and whole.candidate.slopes:
+                self._common.append((np.inf, whole))
+            return
+        if whole.candidate.own and whole.law.creep_rate >= CREEP_RATE_MAX:
+            text = f"it creeps by {CREEP_RATE_MAX:.0%} per decade or more: the maps do not determine its creep"
+            self.refused[name] = text
+            return
+        if best and self._fits_hardly_better(whole, best.whole):
+            self.scores[name] = best.score  # it will not predict better either
         else:
-            fitted = whole
-    closest = min((*residuals, fitted.residual), key=lambda left: np.median(np.linalg.norm(left[usable], axis=1)))
-    relative = {name: s / score for name, s in scores.items()}
-    return Identification(fitted, held_out, closest, relative, refused, quiet)
+            held_out = np.full_like(whole.residual, np.nan)
+            for part in self._parts:
+                held_out[part] = problem.fit(train & ~part, whole).residual[part]
+            self.scores[name] = score = _size(self._run, held_out[train])
+            if best is None or PARSIMONY * score < best.score:
+                self.best = _Tried(score, problem, whole, held_out)
+        self.refused.pop(name, None)
+        if not whole.candidate.own:
+            self._common.append((self.scores[name], whole))
+
+    def _fits_hardly_better(self, richer: LawFit, simpler: LawFit) -> bool:
+        """Whether `richer` contains all laws of `simpler`, and is hardly closer to the maps of the choice."""
+        gain = _size(self._run, simpler.residual[self.train]) / _size(self._run, richer.residual[self.train])
+        return _contains(richer.candidate, simpler.candidate) and gain < PARSIMONY
+
+
+def _with_tests(run: Run, test: Bools, best: _Tried, choice: _Choice) -> tuple[LawFit, Floats]:
+    """The chosen law fitted to all maps, and (M, D) the residual of the `test` maps that fits without them leave."""
+    usable, alone = run.responses.usable, np.where(test[:, None], best.whole.residual, np.nan)
+    held_out = alone.copy()
+    if test[: len(test) // 2].any() or choice.train.sum() < FEW * run.signals.shape[1]:
+        half = 2 * np.cumsum(test) > test.sum()
+        for left_out in (test & half, test & ~half):
+            if left_out.any():
+                held_out[left_out] = best.problem.fit(usable & ~left_out, best.whole).residual[left_out]
+    whole = best.problem.fit(usable, best.whole)
+    if flat := _too_flat(run, whole, choice.slope_min):
+        choice.refused["the fit that includes the test moves"] = flat
+        return best.whole, alone
+    return whole, held_out
 
 
 def _own_law_fits(
