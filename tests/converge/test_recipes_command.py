@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 import typer
 from dm_msgs.action import BuildRecipes
-from dm_msgs.msg import Recipe, RecipeBook
+from dm_msgs.msg import Capabilities, Recipe, RecipeBook
 from typer.testing import CliRunner
 
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import terms_of
 from dm_tools import cli
 from dm_tools.long_actions import recipe_step
+from dm_tools.running_suite import usual_spheres
 from dm_tools.verbs.recipes import curvatures_of, next_of
 
 
@@ -21,6 +22,21 @@ def test_a_list_or_a_range() -> None:
     assert curvatures_of("-0.05:0.05:11") == pytest.approx([-0.05 + 0.01 * k for k in range(11)])
     assert 0.0 in curvatures_of("-0.05:0.05:11")
     assert curvatures_of("-0,05:0,05:11") == curvatures_of("-0.05:0.05:11")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "first", "last"),
+    [(-0.07, 0.06, -0.05, 0.05), (-0.07, 0.01, -0.0684, 0.0084), (0.0, 1.0, 0.02, 0.98)],
+)
+def test_usual_spheres_are_in_reach(low: float, high: float, first: float, last: float) -> None:
+    spheres = usual_spheres(Capabilities(curvature_min=low, curvature_max=high))
+    assert len(spheres) == 11 and (spheres[0], spheres[-1]) == (first, last)
+
+
+def test_without_a_range_there_is_the_reason() -> None:
+    nan = float("nan")
+    with pytest.raises(RuntimeError, match="no curvature is reachable"):
+        usual_spheres(Capabilities(curvature_min=nan, curvature_max=nan, message="no curvature is reachable"))
 
 
 @pytest.mark.parametrize("text", ["a", "0:1", "0:1:1", "0:1:x", "0:1:3:4", "0,02", ",", "nan", "nan:1:3", "0:inf:3"])

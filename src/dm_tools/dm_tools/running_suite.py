@@ -21,6 +21,8 @@ FIND_S = 1.2
 BUSY_S = 5.0
 #: Time in which every node reports its health, and an action its progress, s.
 REPORT_S = 1.5
+#: Curvatures of the spheres in [1] (docs/references.md), section 3.2, 1/m.
+CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 #: A predicted error is mentioned from this size on, m.
 MENTIONED = 0.5e-9
 
@@ -31,6 +33,19 @@ NEEDED = {
     "calibration": "no calibration can be made or loaded",
     "focus_controller": "no curvature can be asked for",
 }
+
+
+def usual_spheres(capabilities: Any) -> tuple[float, ...]:
+    """Curvatures, 1/m, of the spheres in [1], or eleven over the range of a mirror that does not reach them.
+
+    Raises RuntimeError when it reaches none.
+    """
+    low, high = capabilities.curvature_min, capabilities.curvature_max
+    if not low <= high:
+        raise RuntimeError(capabilities.message)
+    if low <= CURVATURES[0] and CURVATURES[-1] <= high:
+        return CURVATURES
+    return tuple(round(low + (high - low) * (0.02 + 0.096 * step), 4) for step in range(11))
 
 
 def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:

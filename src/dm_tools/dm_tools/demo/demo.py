@@ -22,12 +22,11 @@ from dm_tools.demo.demo_bench import (
     wait_for_calibration,
 )
 from dm_tools.output import WAVELENGTH, JsonOption, as_wavelengths, console, next_step, progress_bar, write_json
+from dm_tools.running_suite import usual_spheres
 from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
 #: Default number of maps for the identification of hysteresis and creep.
 MAPS = 200
-#: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
-CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 
 
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
@@ -53,19 +52,6 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     }
 
 
-def curvatures_of(capabilities: Any) -> tuple[float, ...]:
-    """Curvatures [1/m] of the sweep: those of [1], or eleven over the range of a mirror that does not reach them.
-
-    Raises RuntimeError when it reaches none.
-    """
-    low, high = capabilities.curvature_min, capabilities.curvature_max
-    if not low <= high:
-        raise RuntimeError(capabilities.message)
-    if low <= CURVATURES[0] and CURVATURES[-1] <= high:
-        return CURVATURES
-    return tuple(round(low + (high - low) * (0.02 + 0.096 * step), 4) for step in range(11))
-
-
 def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, according to the model."""
     from dm_controller.planning.active_calibration import active_calibration
@@ -80,7 +66,7 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
     from dm_controller.planning.target import FocusTarget
     from dm_tools.verify import map_of, surface_error
 
-    rows, curvatures = [], curvatures_of(client.capabilities)
+    rows, curvatures = [], usual_spheres(client.capabilities)
     with progress_bar() as progress:
         for curvature in progress.track(curvatures, description="focus"):
             prediction = client.focus(curvature, dry_run=True)

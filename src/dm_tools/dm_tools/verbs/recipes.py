@@ -16,10 +16,7 @@ from dm_tools.output import (
     progress_bar,
     write_json,
 )
-from dm_tools.running_suite import naming_holder, running_suite
-
-#: Range of [1], section 3.2.
-DEFAULT = "-0.05:0.05:11"
+from dm_tools.running_suite import naming_holder, running_suite, usual_spheres
 
 
 def curvatures_of(text: str) -> list[float]:
@@ -34,7 +31,7 @@ def curvatures_of(text: str) -> list[float]:
         first, last, number = float(parts[0]), float(parts[1]), int(parts[2])
     except (ValueError, IndexError) as error:
         raise typer.BadParameter(
-            f"curvatures = {text!r}: must be like -0.02,0,0.02, below 1 1/m, or like {DEFAULT}"
+            f"curvatures = {text!r}: must be like -0.02,0,0.02, below 1 1/m, or like -0.05:0.05:11"
         ) from error
     if len(parts) != 3 or not (2 <= number <= 1000 and math.isfinite(first) and math.isfinite(last)):
         raise typer.BadParameter(f"curvatures = {text!r}: first:last:number, with 2 to 1000 of them")
@@ -79,7 +76,10 @@ def next_of(book: Any) -> str:
 def recipes(
     curvatures: Annotated[
         str,
-        typer.Option(help=f"Curvatures [1/m]: -0.02,0,0.02 or first:last:number; empty = {DEFAULT}, 0 with --zernike."),
+        typer.Option(
+            help="Curvatures [1/m]: -0.02,0,0.02 or first:last:number; empty = -0.05:0.05:11 or, on a mirror that does "
+            "not reach these, eleven over its range; 0 with --zernike."
+        ),
     ] = "",
     conic: Annotated[float, typer.Option(help="Conic constant of all: 0 = sphere, -1 = paraboloid.")] = 0.0,
     zernike: Annotated[
@@ -111,12 +111,13 @@ def recipes(
         shapes = [terms_of(text) for text in zernike or ()] or [[]]
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    wanted = curvatures_of(curvatures or ("0" if zernike else DEFAULT))
-    terms = [term for _ in wanted for shape in shapes for term in shape]
-    wanted = [curvature for curvature in wanted for _ in shapes]
+    chosen = curvatures_of(curvatures) if curvatures else [0.0] if zernike else None
     with running_suite(namespace) as client, naming_holder(client):
         client.subscribe("recipes", RecipeBook, qos.LATCHED)
         if not show:
+            each = usual_spheres(client.capabilities) if chosen is None else chosen
+            wanted = [curvature for curvature in each for _ in shapes]
+            terms = [term for _ in each for shape in shapes for term in shape]
             result = _build(
                 client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
             )
