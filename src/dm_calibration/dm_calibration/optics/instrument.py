@@ -12,6 +12,7 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from dm_calibration.optics.map_fit import MapFitter, in_products
+from dm_calibration.optics.orientation import resampled
 from dm_common import Floats
 from dm_common.optics.piston_tilt import fit_plane
 from dm_common.optics.zernike import MAX_ORDER, PISTON_TILT, TERMS
@@ -100,7 +101,7 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
 
 def undistorted(sag: Floats, distortion: float) -> Floats:
     """(height, width) the map without radial distortion, which shows points at the distance r from the centre (1 at the
-    edge) further out by the share `distortion` * r**2. Linear between pixels, NaN where any of these is.
+    edge) further out by the share `distortion` * r**2.
     """
     from scipy import ndimage  # imported here: most benches need no correction
 
@@ -108,8 +109,7 @@ def undistorted(sag: Floats, distortion: float) -> Floats:
     stretch = 1.0 + distortion * np.add.outer(y**2, x**2)
     rows = 0.5 * (sag.shape[0] - 1) - y[:, None] * stretch * half
     columns = 0.5 * (sag.shape[1] - 1) + x * stretch * half
-    moved = ndimage.map_coordinates(sag, (rows, columns), order=1, cval=np.nan)
-    return np.asarray(moved, dtype=np.float64)
+    return resampled(sag, lambda values: ndimage.map_coordinates(values, (rows, columns), order=1))
 
 
 @dataclass(frozen=True)

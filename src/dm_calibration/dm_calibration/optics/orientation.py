@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,9 +45,7 @@ class Orientation:
         if abs(rest) >= _EXACT:
             from scipy import ndimage  # imported here: most benches need no rotation
 
-            # Linear interpolation: a pixel has data if its four neighbours have. It is wrong by the curvature over one
-            # pixel: less than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
-            sag = ndimage.rotate(sag, rest, order=1, cval=np.nan)
+            sag = resampled(sag, lambda values: ndimage.rotate(values, rest, order=1))
         return np.ascontiguousarray(sag, dtype=np.float64)
 
     def after(self, turn: float, mirrored: bool) -> Orientation:
@@ -60,3 +59,15 @@ class Orientation:
         if flip_y:  # the same as the other flip and half a turn
             flip_x, flip_y, rotate = not flip_x, False, rotate + 180.0
         return Orientation(flip_x, flip_y, (rotate + 180.0) % 360.0 - 180.0)
+
+
+def resampled(sag: Floats, interpolate: Callable[[Floats], Floats]) -> Floats:
+    """`sag` (height, width) at other places, by linear interpolation, which gives 0 outside the map.
+
+    Wrong by the curvature over one pixel: less than 0.1 nm on a mirror that a camera of a few hundred pixels resolves.
+    A pixel has data if those between which it lies have at least half of the weight; more would shrink the aperture.
+    """
+    seen = np.isfinite(sag)
+    share = interpolate(seen.astype(np.float64))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(share >= 0.5, interpolate(np.where(seen, sag, 0.0)) / share, np.nan)
