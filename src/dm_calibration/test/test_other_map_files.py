@@ -98,7 +98,8 @@ def test_facts_of_a_fits_file(tmp_path: Path) -> None:
     ],
 )
 def test_the_date_of_a_fits_file(tmp_path: Path, date: str, stamp: float | None) -> None:
-    assert read_map(write(tmp_path, "a.fits", fits_bytes(SAG, **{"DATE-OBS": date}))).time_stamp == stamp
+    cards: dict[str, Any] = {"DATE-OBS": date}
+    assert read_map(write(tmp_path, "a.fits", fits_bytes(SAG, **cards))).time_stamp == stamp
 
 
 @pytest.mark.parametrize(
