@@ -731,31 +731,57 @@ def test_what_a_map_shows_while_the_message_is_made_is_published_too(
     assert listener._dirty
 
 
-def test_maps_do_not_queue_up_while_the_driver_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten a second for a night filled the memory, and the newest was judged hours late."""
+def silent_listener(monkeypatch: pytest.MonkeyPatch, log: SimpleNamespace) -> Any:
+    """A MapListener that has heard nothing of the driver, without its node."""
     listener = cast(Any, MapListener.__new__(MapListener))
     monkeypatch.setattr("dm_calibration.recalibration.map_listener.REPORT_WAIT_S", 0.5)
-    log = SimpleNamespace(info=lambda _text, **_options: None)
-    listener._node = SimpleNamespace(active=True, get_logger=lambda: log)
+    listener._node = SimpleNamespace(active=True, get_logger=lambda: log, check_active=lambda: None)
     listener._values = {"updates.enable": True, "updates.still_time": 0.1}
     listener._updates, listener._busy = SimpleNamespace(in_use=True), lambda: False
     listener._temperatures, listener._refused = SimpleNamespace(at=lambda _time: np.nan), 0
-    listener._incomplete, listener._compared, listener._turn = {}, deque(maxlen=64), threading.Lock()
+    listener._incomplete, listener._compared = {}, deque(maxlen=64)
+    listener._turn, listener._exchange = threading.Lock(), threading.Lock()
     listener.history, listener._worker = AppliedHistory(), ThreadPoolExecutor(1)
+    return listener
+
+
+def hear(listener: Any, stamp: int) -> None:
+    """A map comes over the topics."""
     values = np.ones(3)
+    parts = {
+        "zernike": ZernikeCoefficients(coefficients=stamp * np.ones(21)),
+        "samples": SurfaceSamples(x=values, y=values, weight=values, sag=values),
+        "info": SurfaceMapInfo(),
+    }
+    for name, message in parts.items():
+        message.header.stamp.sec = stamp
+        listener._on_part(name, message)
+
+
+def test_maps_do_not_queue_up_while_the_driver_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten a second for a night filled the memory, and the newest was judged hours late."""
+    listener = silent_listener(monkeypatch, SimpleNamespace(info=lambda _text, **_options: None))
     for stamp in range(1, 21):
-        parts = {
-            "zernike": ZernikeCoefficients(coefficients=stamp * np.ones(21)),
-            "samples": SurfaceSamples(x=values, y=values, weight=values, sag=values),
-            "info": SurfaceMapInfo(),
-        }
-        for name, message in parts.items():
-            message.header.stamp.sec = stamp
-            listener._on_part(name, message)
+        hear(listener, stamp)
     began = time.monotonic()
     listener._worker.shutdown()
     assert listener._refused == 20 and "has not reported" in listener._last_refusal
     assert 0.4 < time.monotonic() - began < 3.0
+
+
+def test_an_update_that_the_disk_does_not_take_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not told as a map that came while the mirror moved: until somebody makes room nothing is corrected any more."""
+    told = list[str]()
+    listener = silent_listener(monkeypatch, SimpleNamespace(warning=lambda text, **_options: told.append(text)))
+
+    def full(*_arguments: object) -> None:
+        raise StoreError("the update of x was not stored in y: No space left on device")
+
+    listener._updates.take, listener.history = full, SimpleNamespace(heard_since=lambda _at: True, settled=lambda *_: 0)
+    hear(listener, 1)
+    listener._worker.shutdown()
+    assert told == ["map not used: the update of x was not stored in y: No space left on device"]
+    assert listener._last_refusal.endswith("No space left on device")
 
 
 def test_a_wide_gap_of_a_mirror_that_is_well_is_no_surprise(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:

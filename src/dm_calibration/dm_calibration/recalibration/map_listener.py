@@ -21,6 +21,7 @@ from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsabl
 from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_calibration.requests import UPDATE_CALIBRATION
+from dm_common.atomic_write import StoreError
 from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
@@ -175,6 +176,9 @@ class MapListener:
                 measured = measurement_from(answer)
                 if not any(measured.same_map(before) for before in self._compared):
                     self._compare(measured, arrived, dry_run=False)
+        except StoreError as error:
+            self._refuse(str(error))
+            log.warning(f"map not used: {error}", throttle_duration_sec=10.0)
         except EXPECTED as error:
             self._refuse(str(error))
             log.info(f"map not used: {error}", throttle_duration_sec=10.0)
