@@ -111,6 +111,19 @@ def test_an_older_map_that_comes_late_is_not_the_last_check(bench: SteadyMirror,
     assert (known(updates).revision, known(updates).checked_ns) == (2, newer.stamp_ns)
 
 
+def test_a_map_dated_a_year_ahead_does_not_end_the_updates(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    """Its clock was set right afterwards: no drift was expected for a year, and maps were refused as surprising."""
+    now, rng, gain = bench.clock_ns, np.random.default_rng(11), np.linspace(0.003, 0.01, bench.mirror.actuators)
+    assert updates.take(bench.measure("ahead", days=365.0), bench.settled()).accepted
+    bench.clock_ns = now
+    for night in range(1, 41):
+        bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
+        bench.drift(gain * night / 100)
+        verdict = updates.take(bench.measure("night", days=1.0), bench.settled(), now_ns=bench.clock_ns + 10**9)
+        assert verdict.accepted, night
+    assert known(updates).checked_ns == bench.clock_ns
+
+
 @pytest.mark.slow
 def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
     updates = begun(made, tmp_path)
@@ -736,6 +749,7 @@ def silent_listener(monkeypatch: pytest.MonkeyPatch, log: SimpleNamespace) -> An
     listener = cast(Any, MapListener.__new__(MapListener))
     monkeypatch.setattr("dm_calibration.recalibration.map_listener.REPORT_WAIT_S", 0.5)
     listener._node = SimpleNamespace(active=True, get_logger=lambda: log, check_active=lambda: None)
+    listener._node.get_clock = lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=10**18))
     listener._values = {"updates.enable": True, "updates.still_time": 0.1}
     listener._updates, listener._busy = SimpleNamespace(in_use=True), lambda: False
     listener._temperatures, listener._refused = SimpleNamespace(at=lambda _time: np.nan), 0

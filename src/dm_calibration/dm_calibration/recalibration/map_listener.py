@@ -1,5 +1,6 @@
 """Maps that arrive between calibrations: over the interferometer's topics, or measured for `update_calibration`."""
 
+import math
 import threading
 import time
 from collections import deque
@@ -206,8 +207,9 @@ class MapListener:
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
+        now_ns = self._node.get_clock().now().nanoseconds or math.inf
         with self._exchange:
-            verdict = self._updates.take(measured, self.history.settled(at, still), dry_run, without)
+            verdict = self._updates.take(measured, self.history.settled(at, still), dry_run, without, now_ns)
         if not dry_run:
             self._taken += verdict.accepted
             if not verdict.accepted:

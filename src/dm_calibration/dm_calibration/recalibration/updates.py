@@ -3,6 +3,7 @@
 The calibration's own file is never changed. Updates are stored beside it, in ``<id>.updates.hdf5``.
 """
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -133,13 +134,19 @@ class RecalibrationManager:
             return self.ignored
 
     def take(
-        self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
+        self,
+        measured: Measurement,
+        settled: SettledState,
+        dry_run: bool = False,
+        without: Sequence[int] = (),
+        now_ns: float = math.inf,
     ) -> Verdict:
         """Compare a map of the mirror in the state `settled` with the calibration, and update that if they agree.
 
         Args:
             without: indices of actuators that no longer move; from now on they have no effect and stand where the map
                 shows them.
+            now_ns: earlier maps dated after it are of before the clock was set back, and count as taken now.
 
         Raises:
             Refusal: no calibration is in use.
@@ -148,8 +155,10 @@ class RecalibrationManager:
         """
         with self._lock:
             kept, options = self.kept(), self._options()
-            calibration, updates = kept.calibration, kept.drift
+            calibration, before = kept.calibration, kept.drift
             check_map(measured, calibration, options)
+            stamp, checked = (int(min(time, now_ns)) for time in (before.stamp_ns, before.checked_ns))
+            updates = replace(before, stamp_ns=stamp, checked_ns=checked)
             if settled.effective.shape != (calibration.fit.actuators,):
                 raise MapNotUsableError(
                     f"the mirror has {settled.effective.size} signals, the calibration {calibration.fit.actuators} "
