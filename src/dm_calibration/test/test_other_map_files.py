@@ -123,6 +123,12 @@ def test_a_fits_file_that_makes_no_sense_is_refused(tmp_path: Path, cards: dict[
         read_map(write(tmp_path, "bad.fits", fits_bytes(SAG, **cards)))
 
 
+def test_a_fits_file_of_integers_without_a_number_for_no_data_is_refused(tmp_path: Path) -> None:
+    """Ignored, its pixels without data were heights."""
+    with pytest.raises(MapFileError, match="BLANK = '-7': must be a finite number"):
+        read_map(write(tmp_path, "bad.fits", fits_bytes(np.full((4, 5), -7, "i2"), BLANK="-7")))
+
+
 def test_a_unit_that_no_fits_file_has_is_told_as_the_parameter(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match="xyz_unit = 'waves': must be a length"):
         read_map(write(tmp_path, "bad.fits", fits_bytes(SAG, BUNIT=None)), xyz_unit="waves")

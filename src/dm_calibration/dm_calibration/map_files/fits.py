@@ -58,7 +58,7 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
     metres = _unit(own_unit, "BUNIT") if own_unit or not unit else _unit(unit, "xyz_unit")
     sag = stored.astype(np.float64) * (_real(header, "BSCALE", 1.0) * metres) + _real(header, "BZERO", 0.0) * metres
     if stored.dtype.kind != "f" and "BLANK" in header:
-        sag[stored == header["BLANK"]] = math.nan
+        sag[stored == _real(header, "BLANK", 0.0)] = math.nan
     sag[~np.isfinite(sag)] = math.nan
     check_heights(sag)
     wavelength = _real(header, "WAVELEN", 0.0)
