@@ -10,12 +10,15 @@ import pytest
 from dm_calibration.hysteresis.features import play_features
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.plan import PlanKind, make_plan
+from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.surface_error import model_candidates, surface_errors, surface_weights
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
 from hysteretic_mirror import calibrated, calibrated_by_pokes, lagging_bench
+from linear_mirror import make_mirror
 
 
 def test_response_is_the_rms_of_the_map_against_its_nominal_surface() -> None:
@@ -79,6 +82,18 @@ def test_an_actuator_that_never_moved_is_no_candidate() -> None:
     fit = fit_influence(maps)
     names, candidates = model_candidates(maps, fit, surface_errors(maps, fit), lambda _: maps.sag)
     assert len(names) == candidates.shape[1] == 37 and "s05" not in names
+    mean, lower, upper = fit_predictor(maps, fit).predict(maps.applied[maps.label.index("p44")])
+    assert 0.0 <= lower <= mean <= upper
+
+
+@pytest.mark.slow
+def test_errors_of_sixty_one_actuators_are_predicted() -> None:
+    """The surfaces of Table 1 do not tell those of the outermost ring apart."""
+    mirror = make_mirror(rings=4)
+    maps = Procedure(make_plan(PlanKind.FULL, mirror), mirror, lagging_bench(mirror)).run().maps()
+    fit = fit_influence(maps)
+    _, candidates = model_candidates(maps, fit, surface_errors(maps, fit), lambda _: maps.sag)
+    assert 38 < candidates.shape[1] < 62
     mean, lower, upper = fit_predictor(maps, fit).predict(maps.applied[maps.label.index("p44")])
     assert 0.0 <= lower <= mean <= upper
 

@@ -13,13 +13,12 @@ import numpy as np
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.quality import GRADE_NOT_EXCITED
 from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
-from dm_calibration.regression.surface_error import model_candidates, regress, surface_errors
-from dm_common import Floats
+from dm_calibration.regression.surface_error import model_candidates, regress, surface_errors, told_apart
+from dm_common import Floats, Ints
 from dm_common.optics.piston_tilt import rms
 
 #: Number of histories, commands in each, and time between commands, s.
@@ -37,6 +36,7 @@ class ErrorPredictor:
         fit: the regression on all surfaces p01-p58.
         held_out_rms: held-out error for these, see :func:`~dm_calibration.regression.surface_error.regress`, m.
         sag: model of the sag from commands, fitted to all good maps.
+        moved: indices of the actuators whose signals are candidates.
         histories: (1 + COMMANDS, HISTORIES, N) normalised signals; the first is rest, where creep has died away.
     """
 
@@ -44,6 +44,7 @@ class ErrorPredictor:
     fit: StepwiseFit
     held_out_rms: float
     sag: SagModel
+    moved: Ints
     histories: Floats
 
     def predict(self, signals: Floats) -> tuple[float, float, float]:
@@ -66,8 +67,7 @@ class ErrorPredictor:
         same = np.broadcast_to(signals, (count, actuators))
         influence, points = self.influence, self.influence.points
         size = rms(surface_control_error(sag, same, influence.influence_zernike, points), points.weight)
-        moving = same[:, influence.grades != GRADE_NOT_EXCITED]
-        mean, lower, upper = self.fit.predict(np.column_stack((size, moving)))
+        mean, lower, upper = self.fit.predict(np.column_stack((size, same[:, self.moved])))
         return (
             max(float(mean.mean()), 0.0),
             max(float(np.percentile(lower, 2.5)), 0.0),
@@ -85,7 +85,8 @@ def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptio
     names, candidates = model_candidates(maps, influence, errors, history.predict)
     fit, held_out_rms = regress(errors, names, candidates, influence.method, options)
     histories = _histories(maps, influence, np.random.default_rng(0))
-    return ErrorPredictor(influence, fit, held_out_rms, history.fit(influence.used), histories)
+    moved = told_apart(influence, errors)
+    return ErrorPredictor(influence, fit, held_out_rms, history.fit(influence.used), moved, histories)
 
 
 def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:

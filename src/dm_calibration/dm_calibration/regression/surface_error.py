@@ -33,9 +33,17 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_NOT_EXCITED
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.influence.surfaces import TABLE_1
+from dm_calibration.influence.surfaces import TABLE_1, TABLE_CHANNELS
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions, StepwiseFit, leave_one_out, stepwise
+from dm_calibration.regression.stepwise import (
+    P_ENTER,
+    P_REMOVE,
+    TOLERANCE,
+    SelectionOptions,
+    StepwiseFit,
+    leave_one_out,
+    stepwise,
+)
 from dm_common import Bools, Floats, Ints
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sample_regions import regional_rms
@@ -138,10 +146,19 @@ def regress(
 def model_candidates(
     maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction
 ) -> tuple[tuple[str, ...], Floats]:
-    """`model` and the signals of the N actuators that were moved: their names, and (S, 1 + N)."""
+    """`model` and the signals of the N actuators told apart: their names, and (S, 1 + N)."""
     model = rms(held_out_errors(maps, fit, errors, predict), maps.points.weight)
-    moved = np.flatnonzero(fit.grades != GRADE_NOT_EXCITED)
+    moved = told_apart(fit, errors)
     return (MODEL, *(f"s{k + 1:02d}" for k in moved)), np.column_stack((model, errors.signals[:, moved]))
+
+
+def told_apart(fit: InfluenceFit, errors: SurfaceErrors) -> Ints:
+    """Indices of the actuators moved, without those beyond Table 1 that all surfaces move like an earlier one."""
+    moved = np.flatnonzero(fit.grades != GRADE_NOT_EXCITED)
+    centred = errors.signals[:, moved] - errors.signals[:, moved].mean(axis=0)
+    size = np.linalg.norm(centred, axis=0)
+    alike = np.abs(centred.T @ centred) > (1.0 - TOLERANCE) * np.outer(size, size)
+    return moved[(moved < TABLE_CHANNELS) | ~np.triu(alike, 1).any(axis=0)]
 
 
 def held_out_errors(maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction) -> Floats:
