@@ -108,7 +108,7 @@ class CandidateProblem:
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
         self._plays = run.along(lambda signals: play_features(signals, candidate.radius, candidate.powers, run.rest))
-        self._plays_crept = np.tensordot(run.creep, self._plays, 1)
+        self._plays_crept = run.crept(self._plays)
         self._scatter = scatter
         self._measured = run.responses.values / scatter
         # Fits to other rows begin at the same slope and take the same steps from it; creep leaves it as it is.
@@ -173,7 +173,7 @@ class CandidateProblem:
     def _fading_of(self, slope: tuple[float, ...]) -> tuple[Floats, Floats]:
         """(M, 1, N) values of the Duhem operator with `slope`, and their creep per unit of creep rate."""
         fading = self.run.fading(FadingHysteresis(np.array(slope)))
-        return fading, np.tensordot(self.run.creep, fading, 1)
+        return fading, self.run.crept(fading)
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
         radius, plays = self.candidate.radius, self._plays.shape[1]

@@ -123,11 +123,6 @@ class Run:
         return None if self.moved is None else self.moved[rows]
 
     @cached_property
-    def creep(self) -> Floats:
-        """(M, M) creep at each map (row) by the shape of each map (column); even spectrum, per unit of creep rate."""
-        return self.crept(np.eye(len(self.time)))
-
-    @cached_property
     def figure(self) -> Floats:
         """(M, 1 + 2 parts) columns of the figure: constant, fading of old creep, drift; then step and fading of each
         resumed part.
