@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import runpy
 import sys
+import tracemalloc
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
@@ -90,6 +92,49 @@ def test_an_actuator_that_never_moves_is_named() -> None:
     assert "actuator 3 is that of the others" in str(found) and np.isfinite(found.influence).all()
 
 
+def test_masked_values_count_as_missing() -> None:
+    commands, measured, times = record(True)
+    masked = np.ma.masked_array(np.where((np.arange(160) == 6)[:, None], 1e3, measured), mask=False)
+    masked[6] = np.ma.masked
+    found = identify_response(commands, masked, times, candidates=STATIC[:1])
+    missing = identify_response(commands, masked.filled(np.nan), times, candidates=STATIC[:1])
+    assert found.measurements == 159 and found.held_out == missing.held_out
+    for array, text in ((commands, "commands: row 7 holds NaN"), (times, "times: number 7 is NaN")):
+        bad = np.ma.masked_array(array, mask=np.zeros(array.shape, dtype=bool))
+        bad[6] = np.ma.masked
+        with pytest.raises(ValueError, match=text):
+            identify_response(bad, measured, times) if array is commands else identify_response(commands, measured, bad)
+
+
+def test_rows_that_no_law_explains_are_named() -> None:
+    commands, measured, times = record(True)
+    stale = measured.copy()
+    stale[70] = stale[69]
+    found = identify_response(commands, stale, times, candidates=STATIC[:1])
+    assert "Rows that no law explains: 71." in str(found)
+    assert not identify_response(commands, measured, times, candidates=STATIC[:1]).remark
+
+
+def test_commands_of_0_to_1_are_doubted_where_the_law_has_a_history() -> None:
+    commands, measured, times = record(True)
+    hysteresis = CANDIDATES[2:3]  # Prandtl-Ishlinskii
+    assert "never negative" in identify_response(0.5 * (commands + 1.0), measured, times, candidates=hysteresis).remark
+    assert "never negative" not in identify_response(commands, measured, times, candidates=hysteresis).remark
+
+
+def test_long_records_need_little_memory() -> None:
+    rng = np.random.default_rng(20)
+    commands = rng.uniform(-1.0, 1.0, (6000, 1))
+    measured = commands + 0.01 * rng.standard_normal((6000, 1))
+    tracemalloc.start()
+    try:
+        found = identify_response(commands, measured, candidates=STATIC[:1])
+        assert tracemalloc.get_traced_memory()[1] < 100e6  # bytes; a matrix of all pairs of rows has 288e6
+    finally:
+        tracemalloc.stop()
+    assert found.held_out["linear"] < 0.02
+
+
 def test_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     commands, measured, times = record(False, 1e-7, 80)
     np.savez(tmp_path / "record.npz", commands=commands, measured=measured, times=times)
@@ -126,6 +171,11 @@ def test_what_is_refused() -> None:
         identify_response(commands, measured, times, moved=times + 0.1)
     with pytest.raises(ValueError, match=r"times: must be times in s, not datetime64\[m\]"):
         identify_response(commands, measured, np.arange(160).astype("datetime64[m]"))
+    with pytest.raises(ValueError, match=r"times: must be times in s: float\(\) argument must be"):
+        identify_response(commands, measured, np.array([datetime(2026, 1, 1, tzinfo=UTC)] * 160))
+    for bad, text in ((measured + 1j, "not complex128"), (measured.astype(str)[:, :1] + "V", "could not convert")):
+        with pytest.raises(ValueError, match=rf"measured: must be real numbers[,:] {text}"):
+            identify_response(commands, bad, times)
     with pytest.raises(ValueError, match="do not separate actuators 3, 5"):
         identify_response(np.where(np.arange(19) == 4, commands[:, 2:3], commands), measured, times)
     with pytest.raises(ValueError, match="candidates: must be at least one law"):

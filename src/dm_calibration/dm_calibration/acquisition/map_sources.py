@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
-from dm_calibration.hysteresis.response_fit import TIME_MAX_S, between, check_signals, seconds_of, times_of
+from dm_calibration.hysteresis.response_fit import TIME_MAX_S, between, check_signals, numbers, times_of
 from dm_calibration.influence.maps import StepKind
 from dm_calibration.map_files import NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
@@ -58,7 +58,7 @@ def outcome_of(
     check_parameters(settings)
     measured, dropped = _measured(maps, settings, hysteresis)
     count = len(measured)
-    signals = np.asarray(commands, dtype=np.float64)
+    signals = numbers(commands, "commands")
     if signals.shape != (count, mirror.actuators):
         raise ValueError(
             f"commands has the shape {signals.shape}: must be ({count}, {mirror.actuators}) finite numbers, a row for "
@@ -80,7 +80,7 @@ def outcome_of(
         last = time.time_ns()
         measured = [replace(one, stamp_ns=last - (count - number) * 10**9) for number, one in enumerate(measured, 1)]
     if moved is not None:
-        measured = _moved(measured, seconds_of(moved, "moved"))
+        measured = _moved(measured, numbers(moved, "moved", "times in s"))
     if hysteresis:
         _check_times(measured, signals)
     outcome = Outcome()
@@ -111,7 +111,8 @@ def outcome_of(
 
 def unix_times(times: ArrayLike, moved: ArrayLike | None) -> tuple[Floats, Floats | None]:
     """`times` (M,) and `moved` (M,), s, as Unix times; if they count from another start, the last map is dated now."""
-    taken, shapes = seconds_of(times, "times"), None if moved is None else seconds_of(moved, "moved")
+    taken = numbers(times, "times", "times in s")
+    shapes = None if moved is None else numbers(moved, "moved", "times in s")
     last = taken.max(initial=-np.inf)
     if time.time() + AHEAD_MAX_S < last < TIME_MAX_S:  # beyond that it is no number of s
         raise ValueError(
@@ -193,7 +194,7 @@ def _of_map(one: str | Path | Floats, number: int, ingest: Ingest, settings: Ing
         stamp = surface.time_stamp or 0.0  # in a damaged file NaN or absurd, and then not known
         known = 0.0 < stamp <= time.time() + AHEAD_MAX_S
         return replace(measured, stamp_ns=round(1e9 * stamp) if known else 0, sha256=surface.sha256)
-    sag = np.ma.asarray(one, dtype=np.float64).filled(np.nan)  # masked pixels have no data
+    sag = numbers(one, f"map {number + 1}")
     if sag.ndim != 2:
         raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), in m")
     seen = sag[np.isfinite(sag)]

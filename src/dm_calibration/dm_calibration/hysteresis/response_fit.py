@@ -6,6 +6,7 @@ times suffice to find which law predicts best, and by how much.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
-from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.responses import Responses, agreeing
 from dm_calibration.hysteresis.run import Run, start_of
 from dm_common import Bools, Floats
 from dm_common.hysteresis.model import HysteresisModel
@@ -43,7 +44,8 @@ class ResponseFit:
         held_out: error of each law on parts of the record that it was not fitted to, relative to the signal: rms over
             all numbers, divided by their standard deviation over the record.
         measurements: number of rows used.
-        remark: sentence that names the actuators that moved too little to show their own law; "" = none.
+        remark: sentences that name rows that contradict every law, actuators that moved too little to show their own
+            law, and commands that may be normalised otherwise than to -1..+1; "" = none.
     """
 
     name: str
@@ -67,7 +69,7 @@ class ResponseFit:
         return np.asarray(self.figure + effective @ self.influence)
 
     def __str__(self) -> str:
-        """The laws side by side, the best marked; with the remark, if any."""
+        """The laws side by side, the best marked; with the remarks, if any."""
         width = max(len(name) for name in self.held_out)
         rows = [f"{'law':<{width}}  held-out error, % of the signal ({self.measurements} measurements)"]
         rows += [
@@ -93,7 +95,8 @@ def identify_response(
         there is no hysteresis, from any state.
     measured : array_like (M, D)
         Measurements of equal uncertainty that are linear in the surface: sag or slopes at points, coefficients. First
-        subtract effects other than the mirror's, such as tilt that changes from map to map. Rows with NaN are ignored.
+        subtract effects other than the mirror's, such as tilt that changes from map to map. Rows with NaN or
+        masked values are ignored.
     times : array_like (M,), optional
         Times of the measurements, s; needed for creep and drift. By default one second apart.
     moved : array_like (M,), optional
@@ -109,7 +112,7 @@ def identify_response(
         Arrays that do not fit together, measurements that have no complete row or never change, actuators that always
         have the same commands, or times that run backwards or are not in s.
     """
-    signals, values = _signals(commands), np.asarray(measured, dtype=np.float64)
+    signals, values = _signals(commands), numbers(measured, "measured")
     if values.ndim != 2 or len(values) != len(signals):
         raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, values per measurement)")
     seconds, shapes = _seconds(times, moved, len(signals))
@@ -117,7 +120,9 @@ def identify_response(
         raise ValueError("times: all are the same; leave them out where they are not known")
     usable: Bools = np.asarray(np.isfinite(values).all(axis=1))
     if not usable.any():
-        raise ValueError("measured: every row holds NaN or infinity; leave out columns that hold them in all rows")
+        raise ValueError(
+            "measured: every row holds NaN, infinity or masked values; leave out the columns with most of them"
+        )
     with np.errstate(over="ignore"):
         size = float(values[usable].std(axis=0).max())
     if not size > 0.0:
@@ -139,6 +144,14 @@ def identify_response(
     middle = seconds - seconds.mean()
     design = np.column_stack((np.ones(len(signals)), middle / np.ptp(middle), run.follow(law)))
     solution = np.linalg.lstsq(design[usable], values[usable], rcond=1e-10)[0]
+    remarks = [found.quiet_remark] if found.quiet else []
+    if (odd := usable & ~agreeing(usable, found.closest)).any():
+        rows = ", ".join(map(str, np.flatnonzero(odd) + 1))
+        remarks.append(f"Rows that no law explains: {rows}. If a measurement failed there, set them to NaN.")
+    if law.has_history and signals.min() >= 0.0:
+        remarks.append(
+            "The commands are never negative: hysteresis needs them as -1 to +1, with 0 where a degauss ends."
+        )
     return ResponseFit(
         name=found.fit.candidate.name,
         law=law,
@@ -147,12 +160,12 @@ def identify_response(
         drift=solution[1],
         held_out={name: error * score for name, score in found.scores.items()},
         measurements=int(usable.sum()),
-        remark=found.quiet_remark,
+        remark="\n".join(remarks),
     )
 
 
 def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
-    signals = np.asarray(commands, dtype=np.float64)
+    signals = numbers(commands, "commands")
     if signals.ndim != 2 or not signals.size or signals.shape[1] != (actuators or signals.shape[1]):
         raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, {actuators or 'actuators'})")
     check_signals(signals)
@@ -183,12 +196,12 @@ def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tu
     seconds = np.arange(count, dtype=np.float64) if times is None else times_of(times, count)
     if moved is None:
         return seconds - seconds[0], None
-    return seconds - seconds[0], between(seconds_of(moved, "moved"), seconds) - seconds[0]
+    return seconds - seconds[0], between(numbers(moved, "moved", "times in s"), seconds) - seconds[0]
 
 
 def times_of(times: ArrayLike, count: int) -> Floats:
     """`times` as (count,) s. Raises ValueError for another number of them, or what cannot be times in s."""
-    seconds = seconds_of(times, "times")
+    seconds = numbers(times, "times", "times in s")
     if seconds.shape != (count,):
         raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), in s")
     if not np.isfinite(seconds).all():
@@ -198,11 +211,15 @@ def times_of(times: ArrayLike, count: int) -> Floats:
     return seconds
 
 
-def seconds_of(values: ArrayLike, name: str) -> Floats:
-    """`values` as numbers. Raises ValueError for dates, whose unit would be lost."""
-    if np.asarray(values).dtype.kind in "mM":
-        raise ValueError(f"{name}: must be times in s, not {np.asarray(values).dtype}")
-    return np.asarray(values, dtype=np.float64)
+def numbers(values: ArrayLike, name: str, kind: str = "real numbers") -> Floats:
+    """`values` as floats, NaN where masked. Raises ValueError for anything but `kind`: dates, complex numbers, text."""
+    given: Any = np.ma.asarray(values)
+    if given.dtype.kind in "cmM":  # would lose a part, or the unit
+        raise ValueError(f"{name}: must be {kind}, not {given.dtype}")
+    try:
+        return np.asarray(given.astype(np.float64).filled(np.nan))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: must be {kind}: {error}") from error
 
 
 def between(moved: Floats, taken: Floats) -> Floats:
