@@ -85,6 +85,11 @@ class Calibration:
     scale_error: float = 0.0
     region_weights: Floats = field(default_factory=lambda: np.zeros(0))
 
+    def __repr__(self) -> str:
+        """What it is of and how good, not the arrays."""
+        law = f"law of the actuators: {self.hysteresis.name}, " if self.hysteresis else ""
+        return f"<Calibration {self.id}: {len(self.maps)} maps, {law}promise {in_nanometres(self.promise)}>"
+
     @property
     def stamp_ns(self) -> int:
         """Time of the last map, ns."""

@@ -82,6 +82,8 @@ def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     calibration = CalibrationStore(file.parent).load(file.stem)
     assert f"stored as {file}" in capsys.readouterr().out
     assert calibration.id == made["calibration"].id  # type: ignore[attr-defined]
+    assert repr(calibration).startswith(f"<Calibration {calibration.id}: {len(commands)} maps")
+    assert len(repr(calibration)) < 200
     assert calibration.limitations == (calibration.limitations[0],)  # no findings of the poke check among them
     np.testing.assert_allclose(np.diff(calibration.maps.stamp_ns), 5e9)
     assert all(len(digest) == 64 for digest in calibration.maps.sha256)

@@ -77,6 +77,8 @@ class ResponseFit:
         ]
         return "\n".join((*rows, *filter(None, (self.remark,))))
 
+    __repr__ = __str__
+
 
 def identify_response(
     commands: ArrayLike,
