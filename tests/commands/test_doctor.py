@@ -307,10 +307,15 @@ def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.M
     def closed() -> None:
         raise PermissionError(13, "Permission denied", "/home/other/maps")
 
-    checks = [("watch_folder", closed), ("nodes that are running", lambda: Finding("none", "", note=True))]
+    def insecure() -> None:
+        raise RuntimeError("error creating node: This Fast DDS version doesn't have the security libraries")
+
+    checks = [("watch_folder", closed), ("messages between nodes", insecure)]
+    checks += [("nodes that are running", lambda: Finding("none", "", note=True))]
     monkeypatch.setattr(doctor_verb, "machine_checks", lambda _namespace: checks)
     with output.console.capture() as said, pytest.raises(typer.Exit):
         doctor_verb.doctor()
+    assert "cure: start the nodes with ROS 2 from apt, or unset ROS_SECURITY_ENABLE" in said.get()
     assert "WRONG watch_folder: cannot be checked:" in said.get() and "/home/other/maps" in said.get()
     assert "none" in said.get()
 

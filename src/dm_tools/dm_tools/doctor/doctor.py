@@ -33,7 +33,10 @@ def doctor(
         try:
             found = run()
         except (OSError, RuntimeError) as error:  # a folder in one that this user may not search; of ROS: no home
-            found = Finding(f"cannot be checked: {error}", "give this user the right to it, or choose another place")
+            cure = "give this user the right to it, or choose another place"
+            if "security" in str(error):
+                cure = "start the nodes with ROS 2 from apt, or unset ROS_SECURITY_ENABLE (docs/security.md)"
+            found = Finding(f"cannot be checked: {error}", cure)
         findings[name] = finding = held_by_the_nodes(name, found, findings.get("nodes that are running"))
         if finding is None or not finding.cure:
             console.print("[green]ok[/]   ", Text(f"{name}: {finding.problem}" if finding else name))
