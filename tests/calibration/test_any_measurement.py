@@ -115,6 +115,12 @@ def test_rows_that_no_law_explains_are_named() -> None:
     assert not identify_response(commands, measured, times, candidates=STATIC[:1]).remark
 
 
+def test_a_shape_may_be_measured_several_times() -> None:
+    commands, measured, times = (np.repeat(array, 2, axis=0) for array in record(True))
+    twice = identify_response(commands, measured, times + np.tile((0.0, 0.1), 160), candidates=STATIC[:1])
+    assert twice.held_out["linear"] == pytest.approx(0.01, rel=0.3)
+
+
 def test_commands_of_0_to_1_are_doubted_where_the_law_has_a_history() -> None:
     commands, measured, times = record(True)
     hysteresis = CANDIDATES[2:3]  # Prandtl-Ishlinskii

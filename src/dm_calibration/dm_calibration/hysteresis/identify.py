@@ -268,6 +268,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
             f"{usable} usable maps: the hysteresis of {actuators} actuators needs at least {needed}; take 100 to 400"
         )
     change = np.diff(run.signals, axis=0)
+    change = change[change.any(axis=1)]  # a shape may be measured several times
     turns = (change[1:] * change[:-1] < 0.0).sum(axis=0)
     swing = np.ptp(run.signals, axis=0)
     quiet = np.flatnonzero((turns < TURNS_MIN) | (swing < SWING_MIN))

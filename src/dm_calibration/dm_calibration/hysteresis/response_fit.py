@@ -149,7 +149,7 @@ def identify_response(
     remarks = [found.quiet_remark] if found.quiet else []
     if (odd := usable & ~agreeing(usable, found.closest)).any():
         rows = ", ".join(map(str, np.flatnonzero(odd) + 1))
-        remarks.append(f"Rows that no law explains: {rows}. If a measurement failed there, set them to NaN.")
+        remarks.append(f"Rows that no law explains: {rows}. Measurements that failed or were lost must be rows of NaN.")
     if law.has_history and signals.min() >= 0.0:
         remarks.append(
             "The commands are never negative: hysteresis needs them as -1 to +1, with 0 where a degauss ends."
