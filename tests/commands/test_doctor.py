@@ -310,7 +310,7 @@ def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.M
     def insecure() -> None:
         raise RuntimeError("error creating node: This Fast DDS version doesn't have the security libraries")
 
-    checks = [("watch_folder", closed), ("messages between nodes", insecure)]
+    checks: list[tuple[str, Any]] = [("watch_folder", closed), ("messages between nodes", insecure)]
     checks += [("nodes that are running", lambda: Finding("none", "", note=True))]
     monkeypatch.setattr(doctor_verb, "machine_checks", lambda _namespace: checks)
     with output.console.capture() as said, pytest.raises(typer.Exit):
