@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import typer
 from dm_msgs.action import BuildRecipes
@@ -13,6 +17,7 @@ from dm_common.recipes import terms_of
 from dm_tools import cli
 from dm_tools.long_actions import recipe_step
 from dm_tools.running_suite import usual_spheres
+from dm_tools.verbs import recipes
 from dm_tools.verbs.recipes import curvatures_of, next_of
 
 
@@ -51,6 +56,20 @@ def test_progress_names_the_shape_being_worked_on() -> None:
     assert recipe_step(at, terms) == "2: +0.0200 1/m with astigmatism cos +200 nm, map 3: largest coefficient 4.0 nm"
     assert "with coma sin +50 nm, " in recipe_step(at, terms_of("coma sin=50")), "one set for all"
     assert recipe_step(at) == "2: +0.0200 1/m, map 3: largest coefficient 4.0 nm"
+
+
+def test_without_a_terminal_each_map_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """No bar is drawn into a file: a run of minutes would say nothing until its end."""
+    told = [BuildRecipes.Feedback(step=step, curvature=0.02, max_zernike=4e-9) for step in (1, 1, 2)]
+
+    def build_recipes(*_goal: Any, on_feedback: Callable[[Any], None]) -> BuildRecipes.Result:
+        for feedback in told:
+            on_feedback(feedback)
+        return BuildRecipes.Result()
+
+    recipes._build(SimpleNamespace(build_recipes=build_recipes), [0.02], 0.0, [])
+    lines = [line for line in capsys.readouterr().out.splitlines() if line]
+    assert lines == [f"recipe 1: +0.0200 1/m, map {step}: largest coefficient 4.0 nm" for step in (1, 2)]
 
 
 def test_added_terms_go_by_the_names_that_measure_prints() -> None:

@@ -44,10 +44,14 @@ def _build(client: Any, curvatures: list[float], conic: float, zernike: list[flo
     from dm_tools.long_actions import recipe_step
 
     with progress_bar() as progress:
-        task = progress.add_task("recipes", total=len(curvatures))
+        task, said = progress.add_task("recipes", total=len(curvatures)), ""
 
         def show(feedback: Any) -> None:
+            nonlocal said
             text = recipe_step(feedback, zernike)
+            if not console.is_terminal and text != said:  # no bar is drawn
+                said = text
+                console.print(f"recipe {text}")
             progress.update(task, completed=feedback.recipes, description=f"recipe {text}")
 
         result = client.build_recipes(curvatures, conic, zernike, on_feedback=show, **options)
