@@ -53,7 +53,7 @@ def simulated_run(
     commands.signals[:, 2] *= third
     mixing = rng.standard_normal((mirror.actuators, 12)) / 4.0
     time = np.cumsum(1.0 + commands.dwell)
-    values = []
+    values: list[NDArray[np.float64]] = []
     for signals, seen in zip(commands.signals, time, strict=True):
         if resumed and len(values) == resumed:
             for swing in np.linspace(1.0, 0.0, 101) * (-1.0) ** np.arange(101):

@@ -130,8 +130,8 @@ def reached_so_far(feedback: Any) -> str:
     if not feedback.expected_max_zernike > 0.0:
         time = f"{feedback.time_left:.0f} s"
         return (
-            f"{text}, the hysteresis law is hardly found yet, then the error falls, {feedback.maps_left} more maps at "
-            f"most ({time})"
+            f"{text}, the hysteresis law is hardly found yet (then the error falls) or fits this mirror worse than "
+            f"most, {feedback.maps_left} more maps at most ({time})"
         )
     expected = in_nanometres(feedback.expected_max_zernike)
     return f"{text}, {expected} expected after {feedback.maps_left} more maps ({feedback.time_left:.0f} s)"
