@@ -18,7 +18,7 @@ from dm_calibration.hysteresis.own_laws import OwnFit, OwnLaws
 from dm_calibration.hysteresis.run import Run
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
-from dm_common import Bools, Floats, Ints
+from dm_common import Bools, Floats
 from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.model import CREEP_RATE_MAX
 
@@ -153,8 +153,13 @@ class _Choice:
 
     def __init__(self, run: Run, train: Bools, folds: int, blocks: int, slope_min: float) -> None:
         self._run, self.train, self.slope_min = run, train, slope_min
-        numbers = _left_out_together(run, train, folds, blocks)
-        self._parts = [numbers == fold for fold in range(folds)]
+        # Each part of a resumed run is divided for itself: a fit without all its maps would not know its figure.
+        fold = np.full(len(train), -1)
+        for rows, _ in run.parts:
+            seen = rows.start + np.flatnonzero(train[rows])
+            if seen.size > 1:
+                fold[seen] = np.arange(seen.size) * folds * blocks // seen.size % folds
+        self._parts = [fold == number for number in range(folds)]
         self.best: _Tried | None = None
         self._common: list[tuple[float, LawFit]] = []
         self.scores: dict[str, float] = {}
@@ -230,19 +235,6 @@ def _own_law_fits(
             yield made[number]
     else:
         yield from fitted
-
-
-def _left_out_together(run: Run, train: Bools, folds: int, blocks: int) -> Ints:
-    """(M,) number from 0 to `folds` - 1 of the fit that does not see a map; -1 = each fit, or none, sees it.
-
-    Each part of a resumed run is divided for itself: a fit without all maps of one part would not know its figure.
-    """
-    numbers = np.full(len(train), -1)
-    for rows, _ in run.parts:
-        seen = rows.start + np.flatnonzero(train[rows])
-        if seen.size > 1:
-            numbers[seen] = np.arange(seen.size) * folds * blocks // seen.size % folds
-    return numbers
 
 
 def _too_flat(run: Run, fit: LawFit, slope_min: float) -> str:
