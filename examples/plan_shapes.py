@@ -2,7 +2,8 @@
 
     ./dm exec python examples/plan_shapes.py CALIBRATION.h5
 
-The mirror must just have been degaussed about mid range, as the run that calibrated it began.
+The mirror must just have been degaussed about mid range, as the run that calibrated it began. What it may have
+held since then, for hours, is not known here and widens the bounds; the nodes keep a record of it.
 """
 
 import sys
