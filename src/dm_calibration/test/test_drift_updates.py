@@ -145,8 +145,8 @@ def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path)
 def test_drift_faster_than_expected_is_followed_and_widens_bounds_until_it_ends(
     bench: SteadyMirror, made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Gains change by 0.1 % a day for two weeks, three times as fast as expected: maps disagreed from day 11 on."""
-    drift = 1e-3 * np.random.default_rng(3).uniform(-1.0, 1.0, bench.mirror.actuators)
+    """Gains change by up to 0.13 % a day for two weeks, four times as fast as expected: most maps came to disagree."""
+    drift = 1.25e-3 * np.random.default_rng(3).uniform(-1.0, 1.0, bench.mirror.actuators)
     errors, refused, promises = list[float](), list[int](), list[float]()
     for kept in (1.0, drift_filter.MISFIT_KEPT):  # the first one never learns that drift is faster
         monkeypatch.setattr(drift_filter, "MISFIT_KEPT", kept)
@@ -162,9 +162,9 @@ def test_drift_faster_than_expected_is_followed_and_widens_bounds_until_it_ends(
             refused[-1] += not updates.take(bench.measure("night", days=1.0), bench.settled()).accepted
             promises.append(promise(updates))
         errors.append(float(np.mean(missed[15:25])))
-    assert refused[0] > 5 and refused[1] == 0
-    assert errors[1] < 0.4 * errors[0]
-    assert promises[15] > 1.25 * promises[0] and promises[-1] == promises[0]
+    assert refused[0] > 10 and refused[1] <= 2
+    assert errors[1] < 0.3 * errors[0]
+    assert promises[15] > 1.2 * promises[0] and promises[-1] < 1.3 * promises[0]
 
 
 def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: RecalibrationManager) -> None:

@@ -116,12 +116,11 @@ class Order:
 
     def fall_back(self, requested: Sequence[float] | Floats) -> bool:
         """Take the other of the last two commands as the present one, if the driver follows it; return whether."""
-        both = self.command, self.earlier
-        if self.earlier is None or all(each is None or each.confirmed for each in both):
+        last, other = self.command, self.earlier
+        if last is None or other is None or (last.confirmed and other.confirmed):
             return False
-        if followed := same_signals(requested, self.earlier.signals):
-            self.earlier, self.command = both
-            self.command.confirmed = True
+        if followed := same_signals(requested, other.signals):
+            self.command, self.earlier, other.confirmed = other, last, True
         return followed
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
