@@ -65,7 +65,12 @@ def calibration_message(
 
 
 def put_updates(
-    message: CalibrationMsg, kept: InUse, temperature: float, doubts: list[str], mirror_changed: bool
+    message: CalibrationMsg,
+    kept: InUse,
+    temperature: float,
+    doubts: list[str],
+    mirror_changed: bool,
+    age_s: float = 0.0,
 ) -> None:
     """Put the updates by later maps into the `message` of their calibration.
 
@@ -73,11 +78,13 @@ def put_updates(
         temperature: degC; NaN = not known.
         doubts: sentences that are added to the known limitations.
         mirror_changed: whether maps show a change of the mirror: the calibration then does not count as CALIBRATED.
+        age_s: s since a map last agreed, or since the calibration; bounds count the drift to be expected in that time.
     """
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    errors = kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)
+    errors = [kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)]
+    errors.append(kept.filter.drift_error(drift, age_s))
     for promise in (message, message.hysteresis):  # no bound falls below the disagreement of maps since one last agreed
         held_out = math.sqrt(drift.excess) * promise.held_out_max_zernike
         promise.held_out_max_zernike = math.hypot(max(held_out, drift.disagreement), *errors)

@@ -34,6 +34,7 @@ from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import TERM_RMS
 from steady_mirror import Floats, SteadyMirror
 
 Made = tuple[SteadyMirror, Calibration]
@@ -165,6 +166,22 @@ def test_drift_faster_than_expected_is_followed_and_widens_bounds_until_it_ends(
     assert refused[0] > 10 and refused[1] <= 2
     assert errors[1] < 0.3 * errors[0]
     assert promises[15] > 1.2 * promises[0] and promises[-1] < 1.3 * promises[0]
+
+
+def test_bounds_count_the_drift_to_be_expected_since_the_last_map(updates: RecalibrationManager) -> None:
+    """Drawn as the options say, 95 % of the errors of terms that use half of the range are within the bound."""
+    kept, rng, days, draws = in_use(updates), np.random.default_rng(6), 30.0, 2000
+    bounds = [kept.filter.drift_error(kept.drift, elapsed * 86400.0) for elapsed in (0.0, 1.0, days)]
+    assert bounds[0] == 0.0 and bounds[2] == pytest.approx(np.sqrt(days) * bounds[1])
+    fit, size = kept.calibration.fit, np.sqrt(days / 2.0) * EXACT.gain_rate
+    gains = size * (rng.standard_normal((draws, 1)) + rng.standard_normal((draws, fit.actuators)))
+    alone = np.linalg.pinv(fit.influence_zernike[3:]).T
+    halves = 0.5 * alone / np.abs(alone).max(axis=1, keepdims=True)
+    figure = np.sqrt(days / kept.filter.reduction.size) * EXACT.figure_rate / TERM_RMS[3:]
+    errors = np.einsum("di,si,ki->dsk", gains, halves, fit.influence_zernike[3:])
+    errors += figure * rng.standard_normal((draws, 1, len(figure)))
+    inside = np.mean(np.abs(errors).max(axis=2) < bounds[2], axis=0)  # of each term
+    assert 0.9 < inside.min() < 0.99
 
 
 def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: RecalibrationManager) -> None:
@@ -724,6 +741,33 @@ def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationMa
     file.unlink()
 
 
+def clock_of(nanoseconds: int, **more: Any) -> SimpleNamespace:
+    """A node whose clock shows this time."""
+    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=nanoseconds))
+    return SimpleNamespace(get_clock=lambda: clock, **more)
+
+
+def test_bounds_that_have_grown_with_the_time_without_a_map_are_published(
+    updates: RecalibrationManager, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener, published = cast(Any, MapListener.__new__(MapListener)), list[float]()
+    message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
+
+    def publish() -> None:
+        listener.amend(message)
+        published.append(message.held_out_max_zernike)
+
+    listener._updates, listener._manager = updates, SimpleNamespace(publish_again=publish)
+    listener._temperatures = SimpleNamespace(published=lambda: np.nan, now=lambda: np.nan, changed=False)
+    listener._values, listener._was_stale = {"updates.stale_after": 1e9}, False
+    monkeypatch.setattr("dm_calibration.recalibration.map_listener.PUBLISH_PERIOD_S", 0.0)
+    for hour in (0, *range(24 * 30)):  # the first message is that of the calibration
+        listener._node = clock_of(in_use(updates).calibration.stamp_ns + hour * 3600 * 10**9)
+        publish() if not published else listener.tick()
+    assert 5 < len(published) < 30 and published == sorted(published)
+    assert published[-1] > 1.5 * published[0]
+
+
 def test_what_a_map_shows_while_the_message_is_made_is_published_too(
     updates: RecalibrationManager, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -740,6 +784,7 @@ def test_what_a_map_shows_while_the_message_is_made_is_published_too(
             return in_use(updates)
 
     listener._updates, listener._temperatures = Meanwhile(), SimpleNamespace(published=lambda: np.nan)
+    listener._node = clock_of(in_use(updates).calibration.stamp_ns)
     monkeypatch.setattr(MapListener, "_doubts", lambda _listener: [])
     listener.amend(calibration_message(in_use(updates).calibration, None, "mirror", 1.0))
     assert listener._dirty
@@ -749,8 +794,7 @@ def silent_listener(monkeypatch: pytest.MonkeyPatch, log: SimpleNamespace) -> An
     """A MapListener that has heard nothing of the driver, without its node."""
     listener = cast(Any, MapListener.__new__(MapListener))
     monkeypatch.setattr("dm_calibration.recalibration.map_listener.REPORT_WAIT_S", 0.5)
-    listener._node = SimpleNamespace(active=True, get_logger=lambda: log, check_active=lambda: None)
-    listener._node.get_clock = lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=10**18))
+    listener._node = clock_of(10**18, active=True, get_logger=lambda: log, check_active=lambda: None)
     listener._values = {"updates.enable": True, "updates.still_time": 0.1}
     listener._updates, listener._busy = SimpleNamespace(in_use=True), lambda: False
     listener._temperatures, listener._refused = SimpleNamespace(at=lambda _time: np.nan), 0

@@ -55,6 +55,12 @@ class HysteresisFit:
     maps: int
     remarks: tuple[str, ...]
 
+    def signal_sigma(self, influence_zernike: Floats) -> float:
+        """Standard deviation of an effective signal that explains these errors with the influence (K, N), m."""
+        scale = TERM_RMS[PISTON_TILT : len(influence_zernike)]
+        reach = np.square(influence_zernike[PISTON_TILT:] * scale[:, None]).sum()
+        return float(np.sqrt(np.square(self.zernike_sigma[PISTON_TILT:] * scale).sum() / reach))
+
 
 def fit_hysteresis(
     maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES, limits: Limits | None = None

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
+from dm_calibration.hysteresis.hysteresis_fit import effective_maps
 from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
@@ -32,7 +32,7 @@ from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, given_up_at, visible_gain, without_response
 from dm_calibration.recalibration.drift import WARM_FIGURE, WARM_GAIN, Comparison, Drift, UpdateOptions, surprise_of
-from dm_common import Floats
+from dm_common import LARGEST_95, Floats
 from dm_common.hysteresis.creep_record import slow_creep
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
@@ -95,7 +95,7 @@ class DriftFilter:
         self._silent = without_response(calibration)
         self._offset = self.reduction.reduce(fit.zernike_offset, fit.sag_offset)
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
-        signal_sigma = options.signal_sigma if hysteresis is None else self._law_sigma(hysteresis)
+        signal_sigma = options.signal_sigma if hysteresis is None else hysteresis.signal_sigma(fit.influence_zernike)
         self._creep_law = HysteresisModel.linear() if hysteresis is None else hysteresis.law
         # Covariance of the values for independent errors of 1 in all effective signals.
         self._unit = self._gain @ self._gain.T
@@ -148,8 +148,7 @@ class DriftFilter:
         # Joseph form: symmetric and positive whatever the rounding.
         kalman = cho_solve(factor, shared.T).T
         left = np.eye(len(prior)) - kalman @ design
-        noise = seen.expected - design @ shared
-        covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
+        covariance = left @ prior @ left.T + kalman @ (seen.expected - design @ shared) @ kalman.T
         evidence, misfit = drift.evidence.copy(), drift.misfit
         surprise = surprise_of(innovation, seen.expected, factor)
         if not repeat:  # a repeat shares the error of the law with the map before it
@@ -178,10 +177,9 @@ class DriftFilter:
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
             ),
         )
-        departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),
-            rms=float(rms(departure, self._fit.points.weight)),
+            rms=float(rms(remove_piston_tilt(seen.sag_error[None], self._fit.points)[0], self._fit.points.weight)),
             surprise=surprise,
             updated=updated,
             displaced=displaced_actuators(innovation, self._visible, factor, self._silent, self.reduction.coefficients),
@@ -255,6 +253,16 @@ class DriftFilter:
         coefficients += np.abs(drift.thermal[0]) * np.abs(self._fit.influence_zernike).sum(axis=1)
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
 
+    def drift_error(self, drift: Drift, elapsed: float) -> float:
+        """95 % bound of the coefficient error, m, by drift in `elapsed` s, at half of what a term alone can reach."""
+        count = self.reduction.coefficients
+        gain, alone = self._gain[:count], np.linalg.pinv(self._gain[:count]).T  # signals of each term alone
+        half = 0.5 * alone / np.maximum(np.abs(alone).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        moved = np.hstack((gain * half, np.eye(count, self.reduction.size)))
+        growth = drift.excess**2 * elapsed / DAY_S * self._growth[: moved.shape[1], : moved.shape[1]]
+        size = np.sqrt(np.einsum("ki,ij,kj->k", moved, growth, moved))
+        return LARGEST_95 * float((size / TERM_RMS[PISTON_TILT : PISTON_TILT + count]).max())
+
     def stuck_error(self, drift: Drift) -> float:
         """Bound of the coefficient error by stuck actuators that creep on, m; 0 without a law of creep."""
         return float((np.abs(self._fit.influence_zernike[PISTON_TILT:]) @ self._creeping_on(drift)).max())
@@ -289,12 +297,4 @@ class DriftFilter:
         model = self._fit.sag_offset + used.applied @ self._fit.influence_sag.T
         values = self.reduction.reduce(used.coefficients, fill_gaps(used.sag, model, used.points))
         residual = values - self._offset - used.applied @ self._gain.T
-        freedom = max(len(used) - self._fit.actuators - 1, 1)
-        return np.asarray(np.square(residual).sum(axis=0) / freedom)
-
-    def _law_sigma(self, hysteresis: HysteresisFit) -> float:
-        """Standard deviation of an effective signal that explains the held-out error of the coefficients."""
-        count = self.reduction.coefficients
-        reach = np.square(self._gain[:count]).sum()
-        error = np.square(hysteresis.zernike_sigma[PISTON_TILT:] * TERM_RMS[PISTON_TILT : PISTON_TILT + count]).sum()
-        return float(np.sqrt(error / reach))
+        return np.asarray(np.square(residual).sum(axis=0) / max(len(used) - self._fit.actuators - 1, 1))

@@ -36,6 +36,8 @@ from dm_common.values import fill_with_nan, wholes
 REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
+#: Bounds grow with the time without a map: they are published again after this time, s, and when it has grown so much.
+AGED_S, AGED = 3600.0, 1.5
 #: Number of maps kept that still lack a message, and of maps remembered so that none counts twice.
 INCOMPLETE_KEPT, MAPS_KEPT = 8, 64
 
@@ -64,10 +66,9 @@ class MapListener:
         self._exchange = threading.Lock()  # a map is compared under the law of its effective signals
         self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
         self._compared: deque[Measurement] = deque(maxlen=MAPS_KEPT)
-        self._taken = self._refused = 0
-        self._last_refusal = ""
+        self._taken, self._refused, self._last_refusal = 0, 0, ""
         self._dirty = self._was_stale = False
-        self._published_at = float("-inf")
+        self._published_at, self._published_age_s = float("-inf"), 0.0
         self._temperatures = TemperatureLog(node, lambda: values["temperature.silent_after"])
         services.temperature = self._temperatures.at
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="updates")
@@ -104,8 +105,10 @@ class MapListener:
     def amend(self, message: CalibrationMsg) -> None:
         """Add the updates by later maps to the message of the calibration in use."""
         self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
+        self._published_age_s = self._age_s
         if (kept := self._updates.in_use) is not None:
-            put_updates(message, kept, self._temperatures.published(), self._doubts(), self._updates.mirror_changed)
+            said = self._temperatures.published(), self._doubts(), self._updates.mirror_changed
+            put_updates(message, kept, *said, self._published_age_s)
 
     @property
     def recipes_in_doubt(self) -> bool:
@@ -141,7 +144,8 @@ class MapListener:
         """Publish changes that are due; called about once a second by the node."""
         stale, kept = self._stale, self._updates.in_use
         warmed = kept is not None and kept.drift.thermal_trust > 0.0 and self._temperatures.changed
-        if self._dirty or stale != self._was_stale or warmed:
+        aged = self._age_s > max(AGED_S, AGED * self._published_age_s)
+        if self._dirty or stale != self._was_stale or warmed or aged:
             self._was_stale = stale
             self._changed()
 
@@ -236,8 +240,7 @@ class MapListener:
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
-        other = "dry_run" if request.dry_run else "without"
-        if request.dry_run or request.without:
+        if other := "dry_run" if request.dry_run else "without" if request.without else "":
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"forget and {other}: only one of them may be set")
         with self._turn:
             self._updates.forget()

@@ -4,17 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dm_common import Floats
+from dm_common import LARGEST_95, SIGMAS_95, Floats
 from dm_common.hysteresis.creep_record import SLOW_S
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_controller.planning.mirror_model import SIGMAS_95
 
 #: Ages of a shape, s, for which a bound holds, besides the moment when it is to be right.
 AGES = (1.0, 10.0, 100.0)
 #: The calibration's figure includes the creep left at this time after `crept_at`, s: half of a typical run.
 IN_FIGURE_S = 200.0
-#: 95 % quantile of the largest of as many independent errors as coefficients, in standard deviations.
-LARGEST = 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
 #: Assumed relative error of creep: that of elements with time constants (s) below and above these two, if the
@@ -130,7 +127,7 @@ class CreepError:
         each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
         each = each @ np.square(self._rows).T
         count = self._coefficients
-        largest = SIGMAS_95**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
+        largest = SIGMAS_95**2 * shared[:, :count].max(axis=1) + LARGEST_95**2 * each[:, :count].max(axis=1)
         rms = (shared + each)[:, count:].sum(axis=1)
         worst = int(largest.argmax())
         most = bool(SIGMAS_95**2 * unseen[worst, :count].max() > 0.5 * largest[worst])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dm_common import Bools, Floats
+from dm_common import SIGMAS_95, Bools, Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.conic import reachable_range
@@ -37,8 +37,6 @@ RIDGE_SHARE_STUCK = 0.1
 TILT_WEIGHT = 10.0
 #: Tilt at the edge, as a share of the largest response, below which the maps hold none; an actuator makes 1.5.
 LEAST_TILT = 0.05
-#: Half-width of a 95 % interval in standard deviations.
-SIGMAS_95 = 1.96
 
 
 @dataclass(frozen=True)

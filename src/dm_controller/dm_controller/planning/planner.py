@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from dm_msgs.msg import FocusRequest
 
-from dm_common import Floats
+from dm_common import SIGMAS_95, Floats
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
-from dm_controller.planning.mirror_model import SIGMAS_95, CalibratedMirror, Plan, rms_bounds
+from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:

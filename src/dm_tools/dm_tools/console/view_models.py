@@ -10,12 +10,10 @@ from dm_msgs.msg import ActuatorState, Capabilities, FocusRequest
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from dm_common import Floats
+from dm_common import SIGMAS_95, Floats
 from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 
-#: Half-width of a 95 % interval in standard deviations.
-SIGMAS_95 = 1.96
 #: Largest number of recipes in one run.
 NUMBER_MAX = 1000
 SIGNAL_COLOURS = colormaps["cividis"]  # taken once: each time Matplotlib makes a copy, whose table it computes anew
