@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import deque
@@ -154,7 +155,7 @@ def test_drift_faster_than_expected_is_followed_and_widens_bounds_until_it_ends(
         (folder := tmp_path / f"{kept}").mkdir()
         updates = begun(made, folder, replace(EXACT, figure_rate=1e-10))
         rng, missed = np.random.default_rng(11), list[float]()
-        bench.clock_ns, promises = made[1].stamp_ns, [promise(updates)]
+        bench.clock_ns, promises, told = made[1].stamp_ns, [promise(updates)], list[str]()
         refused.append(0)
         for night in range(45):
             bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
@@ -162,10 +163,12 @@ def test_drift_faster_than_expected_is_followed_and_widens_bounds_until_it_ends(
             missed.append(error(bench, changed_fit(updates)))
             refused[-1] += not updates.take(bench.measure("night", days=1.0), bench.settled()).accepted
             promises.append(promise(updates))
+            told.append(" ".join(updates.widened))
         errors.append(float(np.mean(missed[15:25])))
     assert refused[0] > 10 and refused[1] <= 2
     assert errors[1] < 0.3 * errors[0]
     assert promises[15] > 1.2 * promises[0] and promises[-1] < 1.3 * promises[0]
+    assert re.search(r"faster than updates.gain_rate and updates.figure_rate: bounds are \d\d% wider until", told[14])
 
 
 def test_bounds_count_the_drift_to_be_expected_since_the_last_map(updates: RecalibrationManager) -> None:
@@ -820,9 +823,9 @@ def hear(listener: Any, stamp: int) -> None:
 def test_maps_do_not_queue_up_while_the_driver_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten a second for a night filled the memory, and the newest was judged hours late."""
     listener = silent_listener(monkeypatch, SimpleNamespace(info=lambda _text, **_options: None))
+    began = time.monotonic()
     for stamp in range(1, 21):
         hear(listener, stamp)
-    began = time.monotonic()
     listener._worker.shutdown()
     assert listener._refused == 20 and "has not reported" in listener._last_refusal
     assert 0.4 < time.monotonic() - began < 3.0

@@ -31,6 +31,8 @@ from dm_common.optics.zernike import PISTON_TILT
 REPEAT_S = 3600.0
 #: Times of moves that differ by less than this, s, belong to the same move.
 SAME_MOVE_S = 0.2
+#: Least share by which bounds are wider for drift that is worth a sentence.
+WIDER_MENTIONED = 0.05
 SUFFIX = ".updates.hdf5"
 
 
@@ -105,14 +107,23 @@ class RecalibrationManager:
 
     @property
     def widened(self) -> list[str]:
-        """A sentence if maps widen the bounds but leave no doubt of the calibration."""
-        surprising = 0 if (kept := self.in_use) is None else kept.drift.surprising
-        if kept is not None and not surprising and kept.drift.disagreement:
-            return ["The last map shows an actuator that may begin to fail: bounds are wider until one does not."]
-        if not 0 < surprising < self._options().surprises_max:
+        """Sentences if maps widen the bounds but leave no doubt of the calibration."""
+        if (kept := self.in_use) is None:
             return []
-        last = "map disagrees" if surprising == 1 else f"{surprising} maps disagree"
-        return [f"The last {last} with this calibration: bounds are wider until one agrees."]
+        drift, sentences = kept.drift, list[str]()
+        if (wider := math.sqrt(drift.excess) - 1.0) >= WIDER_MENTIONED:
+            sentences.append(
+                "The last maps differ by more than expected, as by drift faster than updates.gain_rate and "
+                f"updates.figure_rate: bounds are {wider:.0%} wider until they do not."
+            )
+        if not drift.surprising and drift.disagreement:
+            sentences.append(
+                "The last map shows an actuator that may begin to fail: bounds are wider until one does not."
+            )
+        if 0 < drift.surprising < self._options().surprises_max:
+            last = "map disagrees" if drift.surprising == 1 else f"{drift.surprising} maps disagree"
+            sentences.append(f"The last {last} with this calibration: bounds are wider until one agrees.")
+        return sentences
 
     def begin(self, calibration: Calibration | None) -> str:
         """Update `calibration` from now on, beginning with its stored updates. Returns why those are not used, or "".
