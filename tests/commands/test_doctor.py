@@ -305,7 +305,7 @@ def test_a_device_server_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.MonkeyPatch) -> None:
     def closed() -> None:
-        raise PermissionError(13, "Permission denied", "/home/other/maps")
+        raise PermissionError(13, "Permission denied", "/home/other/security/maps")
 
     def insecure() -> None:
         raise RuntimeError("error creating node: This Fast DDS version doesn't have the security libraries")
@@ -316,8 +316,8 @@ def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.M
     with output.console.capture() as said, pytest.raises(typer.Exit):
         doctor_verb.doctor()
     assert "cure: start the nodes with ROS 2 from apt, or unset ROS_SECURITY_ENABLE" in said.get()
-    assert "WRONG watch_folder: cannot be checked:" in said.get() and "/home/other/maps" in said.get()
-    assert "none" in said.get()
+    assert "WRONG watch_folder: cannot be checked:" in said.get() and "/home/other/security/maps" in said.get()
+    assert "cure: give this user the right to it" in said.get() and "none" in said.get()
 
 
 def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:

@@ -45,7 +45,8 @@ def usual_spheres(capabilities: Any) -> tuple[float, ...]:
         raise RuntimeError(capabilities.message)
     if low <= CURVATURES[0] and CURVATURES[-1] <= high:
         return CURVATURES
-    return tuple(round(low + (high - low) * (0.02 + 0.096 * step), 4) for step in range(11))
+    spheres = (low + (high - low) * (0.02 + 0.096 * step) for step in range(11))
+    return tuple(float(f"{curvature:.4g}") for curvature in spheres)
 
 
 def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:

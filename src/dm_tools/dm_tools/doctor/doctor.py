@@ -34,7 +34,7 @@ def doctor(
             found = run()
         except (OSError, RuntimeError) as error:  # a folder in one that this user may not search; of ROS: no home
             cure = "give this user the right to it, or choose another place"
-            if "security" in str(error):
+            if "security libraries" in str(error):  # of Fast DDS, which the wheels lack
                 cure = "start the nodes with ROS 2 from apt, or unset ROS_SECURITY_ENABLE (docs/security.md)"
             found = Finding(f"cannot be checked: {error}", cure)
         findings[name] = finding = held_by_the_nodes(name, found, findings.get("nodes that are running"))
