@@ -128,8 +128,8 @@ class DeformableMirrorClient(Connection):
 
         def refusal() -> tuple[int, str]:
             state, able = self.messages.get("actuator_state"), self.messages.get("capabilities")
-            if (driver := self._servers["set_signals"]).lost or state is None:
-                return ErrorCode.DRIVER_UNAVAILABLE, driver.text if driver.lost else "pdm_driver: is it running?"
+            if (driver := self._servers["set_signals"]).lost:
+                return ErrorCode.DRIVER_UNAVAILABLE, driver.text
             if (refused := driver_refusal(state)) is not None:
                 return refused.error_code, str(refused)
             return (able.error_code, able.message) if able and able.error_code in RESTING else (0, "")

@@ -74,6 +74,14 @@ def test_it_is_not_ready_while_the_driver_is_lost_whatever_that_said_before() ->
     assert waited.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
 
 
+def test_without_a_report_the_driver_may_not_run() -> None:
+    mirror = client(ActuatorState.STATE_ACTIVE, None)
+    del mirror.messages["actuator_state"]
+    with pytest.raises(DeformableMirrorError, match="no actuator_state from pdm_driver yet") as at:
+        mirror.wait_until_active(0.0)
+    assert at.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
+
+
 def test_what_was_heard_last_is_not_told_once_nothing_more_can_come() -> None:
     mirror = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
     assert mirror.actuator_state.driver_state == ActuatorState.STATE_ACTIVE

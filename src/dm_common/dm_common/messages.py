@@ -38,8 +38,7 @@ def taken(source: Any, *names: str) -> dict[str, Any]:
 
 def answer_with(answer: Any, code: int, text: str) -> None:
     """Set error code and message in an answer, and in a FocusState inside it, if they have these fields."""
-    each: Any
-    for each in (answer, getattr(answer, "state", None)):
+    for each in (answer, getattr(answer, "state", answer)):
         if hasattr(each, "error_code"):
             each.error_code, each.message = code, text
 
@@ -137,8 +136,10 @@ def measurement_from(response: Any) -> Measurement:
     )
 
 
-def driver_refusal(report: ActuatorState) -> Refusal | None:
-    """The refusal by a driver that takes no commands, with the code that it would answer; None = it takes them."""
+def driver_refusal(report: ActuatorState | None) -> Refusal | None:
+    """The refusal by a driver that takes no commands, by its last report, or by none; None = it takes them."""
+    if report is None:
+        return Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
     if report.driver_state == ActuatorState.STATE_ACTIVE:
         return None
     reason = f": {report.message}" if report.message else ""
@@ -216,7 +217,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         _shaped("creep_spectrum", message.creep_spectrum, creep_time.size, own=True),
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
-        _shaped("creep_covariance", message.creep_covariance, 2, *(1 + creep_time.size,) * 2),
+        _shaped("creep_covariance", message.creep_covariance, 2, 1 + creep_time.size, 1 + creep_time.size),
         _shaped("lag_spectrum", message.lag_spectrum, *own, -1),
         message.creep_slope,
         rate,
@@ -246,8 +247,7 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
     Raises:
         ValueError: its arrays do not fit together.
     """
-    count = len(message.signals)
-    if not count:
+    if not (count := len(message.signals)):
         return ActuatorEstimate(None, message.message)
     values = {name: np.array(getattr(message, name), dtype=np.float64) for name in _STATE}
     for name in ("play", "fading", "crept", "lagged"):

@@ -133,11 +133,7 @@ class DriverMonitor:
 
     def refusal(self, now: float) -> Refusal | None:
         """The reason why the driver takes no commands, by its last report and its age; None = it takes them."""
-        report = self.latest
-        if report is None:
-            text = "no actuator_state from pdm_driver yet: is the driver running?"
-            return Refusal(ErrorCode.DRIVER_UNAVAILABLE, text)
-        if (refusal := driver_refusal(report)) is not None and not self.loss:
+        if (refusal := driver_refusal(self.latest)) is not None and not self.loss:
             return refusal
         if silent := self.silent(now):
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)

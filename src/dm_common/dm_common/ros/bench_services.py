@@ -108,7 +108,7 @@ class BenchServices:
 
     def check_ready(self) -> None:
         """Raise Refusal when the driver says that it takes no commands."""
-        refusal = None if self.state is None else driver_refusal(self.state)
+        refusal = driver_refusal(self.state)
         if refusal is not None and refusal.error_code == ErrorCode.DRIVER_INACTIVE:  # a lost link comes back
             raise refusal
 

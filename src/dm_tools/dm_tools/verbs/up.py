@@ -148,9 +148,9 @@ def lacks(messages: Mapping[str, Any]) -> str:
     from dm_client.connection import RESTING
     from dm_common.messages import driver_refusal
 
-    state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
-    if state is None or (refusal := driver_refusal(state)) is not None:
-        return "pdm_driver is not heard" if state is None else str(refusal)
+    capabilities = messages.get("capabilities")
+    if (refusal := driver_refusal(messages.get("actuator_state"))) is not None:
+        return str(refusal)
     if capabilities is not None and capabilities.error_code in RESTING:
         return str(capabilities.message or "focus_controller takes no requests yet")
     if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
