@@ -8,6 +8,7 @@ import tracemalloc
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,7 +181,12 @@ def test_what_is_refused() -> None:
         identify_response(commands, measured, np.arange(160).astype("datetime64[m]"))
     with pytest.raises(ValueError, match=r"times: must be times in s: float\(\) argument must be"):
         identify_response(commands, measured, np.array([datetime(2026, 1, 1, tzinfo=UTC)] * 160))
-    for bad, text in ((measured + 1j, "not complex128"), (measured.astype(str)[:, :1] + "V", "could not convert")):
+    uneven: Any = [*measured.tolist()[1:], [1.0]]
+    for bad, text in (
+        (measured + 1j, "not complex128"),
+        (measured.astype(str)[:, :1] + "V", "could not convert"),
+        (uneven, "setting an array element with a sequence"),
+    ):
         with pytest.raises(ValueError, match=rf"measured: must be real numbers[,:] {text}"):
             identify_response(commands, bad, times)
     with pytest.raises(ValueError, match="do not separate actuators 3, 5"):

@@ -131,7 +131,9 @@ def identify(
 
 
 class _Tried(NamedTuple):
-    """A candidate's fit to all maps of the choice, `held_out` (M, D) residual of each part of the run, and its rms."""
+    """A candidate with `whole`, its fit to all maps of the choice, `held_out`, the (M, D) residual that fits without
+    the same part of the run leave, NaN elsewhere, and `score`, the rms of that.
+    """
 
     score: float
     problem: CandidateProblem | OwnLaws

@@ -214,14 +214,17 @@ def times_of(times: ArrayLike, count: int) -> Floats:
 
 
 def numbers(values: ArrayLike, name: str, kind: str = "real numbers") -> Floats:
-    """`values` as floats, NaN where masked. Raises ValueError for anything but `kind`: dates, complex numbers, text."""
-    given: Any = np.ma.asarray(values)
-    if given.dtype.kind in "cmM":  # would lose a part, or the unit
-        raise ValueError(f"{name}: must be {kind}, not {given.dtype}")
+    """`values` as floats, NaN where masked.
+
+    Raises ValueError for what is no `kind`: dates, complex numbers, text that is no number, rows of unequal length.
+    """
     try:
-        return np.asarray(given.astype(np.float64).filled(np.nan))
+        given: Any = np.ma.asarray(values)
+        if given.dtype.kind not in "cmM":  # would lose a part, or the unit
+            return np.asarray(given.astype(np.float64).filled(np.nan))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: must be {kind}: {error}") from error
+    raise ValueError(f"{name}: must be {kind}, not {given.dtype}")
 
 
 def between(moved: Floats, taken: Floats) -> Floats:
