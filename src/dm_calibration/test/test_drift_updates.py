@@ -405,6 +405,14 @@ def test_a_map_that_agrees_names_an_actuator_that_begins_to_fail(
     assert promise(updates) == pytest.approx(before, rel=0.2) and not updates.widened
 
 
+def test_one_that_moves_again_widens_bounds_too(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    updates, settled = begun(made, tmp_path, UpdateOptions(signal_sigma=2e-2)), bench.settled()
+    for name, at in (("dead", -0.4), ("moves", -0.2)):
+        bench.apply(np.where(np.arange(bench.signals.size) == 6, at, bench.signals))
+        assert updates.take(bench.measure(name), settled, without=[6] if name == "dead" else []).accepted
+    assert "begin to fail, or moves again: bounds are wider" in updates.widened[-1]
+
+
 def test_an_error_of_the_law_is_not_put_down_to_actuators(bench: SteadyMirror, updates: RecalibrationManager) -> None:
     """It passed for two actuators displaced by a few hundredths of a signal, which were to be given up."""
     settled = bench.settled()

@@ -118,7 +118,8 @@ class RecalibrationManager:
             )
         if not drift.surprising and drift.disagreement:
             sentences.append(
-                "The last map shows an actuator that may begin to fail: bounds are wider until one does not."
+                "The last map shows an actuator that may begin to fail, or moves again: bounds are wider until one "
+                "does not."
             )
         if 0 < drift.surprising < self._options().surprises_max:
             last = "map disagrees" if drift.surprising == 1 else f"{drift.surprising} maps disagree"
