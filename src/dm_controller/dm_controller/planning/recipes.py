@@ -49,7 +49,7 @@ class FoundRecipe:
         effective: (N,) effective signals.
         error: m, bound of the largest coefficient error without creep: as re-measured at the recipes used, plus the
             possible change of the correction away from them.
-        built: s, when the oldest of the recipes used was measured; 0 = not known.
+        built: s, when the run that built the oldest of the recipes used had ended; 0 = not known.
     """
 
     effective: Floats
