@@ -145,14 +145,13 @@ def driver_refusal(report: ActuatorState | None) -> Refusal | None:
     reason = f": {report.message}" if report.message else ""
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
         return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, f"pdm_driver has lost the link to the electronics{reason}")
-    says_so = report.message and report.driver_state != ActuatorState.STATE_SAFING  # and what to do
-    return Refusal(ErrorCode.DRIVER_INACTIVE, report.message if says_so else f"pdm_driver is not active{reason}")
+    if report.driver_state == ActuatorState.STATE_SAFING:
+        return Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
+    return Refusal(ErrorCode.DRIVER_INACTIVE, report.message or "pdm_driver is not active: activate it first")
 
 
 def unused_as_requested(report: ActuatorState) -> ActuatorState:
-    """For actuators without a channel, set the applied signals to the requested ones: they cannot move, so the
-    difference is not a shape to correct or to keep.
-    """
+    """For actuators without a channel, which cannot move, set the applied signals to those requested."""
     unused = np.bitwise_and(np.asarray(report.flags, dtype=np.uint8), ActuatorState.FLAG_UNUSED) > 0
     if unused.any() and len(report.requested) == len(report.applied) == len(unused):
         report.applied = doubles(np.where(unused, report.requested, report.applied))
