@@ -15,7 +15,7 @@ import pytest
 from dm_msgs.action import Calibrate
 
 from dm_calibration.calibration_action import CalibrateAction
-from dm_calibration.calibrator import Provenance, calibrate
+from dm_calibration.calibrator import Provenance, calibrate, fit_effective
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
@@ -31,6 +31,7 @@ from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
+from dm_common.optics.zernike import basis
 from hysteretic_mirror import MIRROR, lagging_bench
 from map_hashes import map_hashes, record_hash
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
@@ -315,6 +316,20 @@ def test_an_interrupted_hysteresis_run_knows_the_law_as_well(tmp_path: Path) -> 
     assert parts.law.creep_rate == pytest.approx(whole.law.creep_rate, rel=0.1)
     blind = fit_hysteresis(replace(maps, segment=np.zeros_like(maps.segment)), candidates=laws)
     assert blind.held_out_max_zernike > 2.0 * parts.held_out_max_zernike  # what not knowing of the cuts would cost
+
+
+def test_a_figure_that_changed_in_an_interruption_is_no_creep(tmp_path: Path) -> None:
+    laws = [candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii"]
+    maps = interrupted(PlanKind.HYSTERESIS, SimulationConfig(seed=90125), tmp_path, (60,))
+    bent = np.zeros(21)
+    bent[3:6] = 20e-9, 10e-9, -10e-9
+    change = np.outer(maps.segment, bent)
+    modes = basis(maps.points.x, maps.points.y)
+    changed = replace(maps, coefficients=maps.coefficients + change, sag=maps.sag + change @ modes.T)
+    before, after = (
+        fit_effective(each, fit_hysteresis(each, candidates=laws), FitOptions(), MIRROR) for each in (maps, changed)
+    )
+    assert after.zernike_offset - before.zernike_offset == pytest.approx(bent, abs=2e-9)
 
 
 @pytest.mark.parametrize(("law", "figure"), [("none", 2.5e-9), ("prandtl_ishlinskii", 25e-9)])

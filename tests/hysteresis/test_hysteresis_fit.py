@@ -174,8 +174,8 @@ def test_creep_of_before_is_found_though_each_wrong_map_hides_the_next() -> None
     fading = np.exp(-np.linspace(0.0, 3.0, 120))[:, None, None] * np.ones(3)
     values = 1e-6 * (effective + 0.5 * fading[:, 0]) @ rng.standard_normal((3, 5)) + 1e-9 * noise
     values[20:25] += 1e-7 * 12.0 ** np.arange(hysteresis_fit.OUTLIER_ROUNDS + 1)[:, None]
-    responses = Responses(values, 5, np.ones(120, dtype=bool))
-    np.testing.assert_allclose(hysteresis_fit._crept_before(responses, effective, fading), 0.5, atol=0.1)
+    measured = Run(effective, np.arange(120.0), Responses(values, 5, np.ones(120, dtype=bool)))
+    np.testing.assert_allclose(hysteresis_fit._crept_before(measured, effective, fading), 0.5, atol=0.1)
 
 
 @pytest.mark.parametrize("low", [-1.0, -0.5])

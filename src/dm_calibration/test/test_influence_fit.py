@@ -129,6 +129,20 @@ def test_drift_columns_are_hat_functions() -> None:
     assert repeated == pytest.approx(np.array([[1, 0], [1, 0], [0.75, 0.25], [0.5, 0.5], [0.25, 0.75], [0, 1]]))
 
 
+def test_the_figure_of_a_resumed_run_is_that_of_its_last_part(mirror: Mirror) -> None:
+    plant = LinearMirror(mirror.x, mirror.y)
+    maps = measure(plant, mirror)
+    resumed = np.arange(len(maps)) >= np.flatnonzero(maps.reference)[3]
+    change = 0.5 * plant.figure_coefficients
+    sag, coefficients = (
+        values + np.outer(resumed, now)
+        for values, now in ((maps.sag, plant.modes @ change), (maps.coefficients, change))
+    )
+    fit = fit_influence(replace(maps, sag=sag, coefficients=coefficients, segment=resumed.astype(int)))
+    assert np.abs(fit.influence_sag - true_sag(plant)).max() < 1e-6 * NM
+    assert fit.zernike_offset == pytest.approx(plant.figure_coefficients + change, abs=1e-6 * NM)
+
+
 def test_standard_errors_are_the_scatter_of_repeated_calibrations(mirror: Mirror) -> None:
     plant = LinearMirror(mirror.x, mirror.y, noise=5 * NM)
     fits = [fit_influence(measure(plant, mirror)) for _ in range(4)]

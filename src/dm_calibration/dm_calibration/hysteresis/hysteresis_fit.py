@@ -9,7 +9,7 @@ from dm_calibration.hysteresis.actuator_weights import weights_of
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.identify import Identification, identify
-from dm_calibration.hysteresis.responses import Responses, agreeing
+from dm_calibration.hysteresis.responses import agreeing
 from dm_calibration.hysteresis.run import Run, basis_of, run_of, without
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_common import Bools, Floats
@@ -27,6 +27,9 @@ CREPT_MAX = 1.5
 #: mirrors of ten were inside it with 75 maps beyond, 95 % within 1.2 times the bound; with 53 beyond, 40 to 50 % of
 #: the requests to three mirrors, and 90 % within 2.1 to 2.9 times the bound.
 MAPS_BEYOND, FEWER = 85, 3
+#: Prior standard deviation of a change of the figure between two parts of a run that is not creep, m. A change of 20 nm
+#: is found by 1 to 10; the more, the less is known of the creep from before a last part of few maps.
+FIGURE_STEP = 1e-9
 #: A test move counts as held if its map comes this much later after it than the median, s; fewest that count.
 HELD_LONGER_S, HELD_MIN = 0.9, 4
 #: Random draws for the quantile of the largest of several correlated errors.
@@ -179,26 +182,28 @@ def _followed(maps: MapSet, law: HysteresisModel, run: Run) -> tuple[MapSet, Hys
     for number, (rows, start) in enumerate(run.parts):
         elapsed = run.time[rows, None] - start
         fading[rows, number] = np.exp(-elapsed / law.creep_time) @ np.atleast_2d(law.creep_share).T
-    crept = _crept_before(run.responses, effective, fading)
+    crept = _crept_before(run, effective, fading)
     began = 1e-9 * int(maps.stamp_ns[0]) + run.parts[-1][1]
     effective = effective + np.einsum("msn,sn->mn", fading, crept)
     rest = law.demagnetised(maps.actuators, began, run.rest).position
     return replace(maps, applied=effective), replace(law, crept_at=began, crept=rest + crept[-1])
 
 
-def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
+def _crept_before(run: Run, effective: Floats, fading: Floats) -> Floats:
     """(S, N) effective signals to which the mirror had crept before each degauss, from the fading part of the figure.
 
     Without this the fading part counts as figure, which then holds only at the time of the run. The prior standard
-    deviation is 1, the size of all effective signals; that suppresses patterns which the maps hardly show. Maps that
-    contradict the effective signals are left out.
+    deviation is 1, the size of all effective signals; that suppresses patterns which the maps hardly show. Between two
+    parts the figure may also change for good, by about FIGURE_STEP. Maps that contradict the effective signals are left
+    out.
 
     Args:
         effective: (M, N).
         fading: (M, S, N) share of that creep that is left in each map.
     """
-    good, count, values = responses.usable, responses.coefficients, responses.values
-    whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
+    good, count, values = run.responses.usable, run.responses.coefficients, run.responses.values
+    steps = run.figure[:, 3::2]
+    whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2), steps))
     for _ in range(OUTLIER_ROUNDS):
         used = good
         solution = np.linalg.lstsq(whole[used], values[used], rcond=1e-10)[0]
@@ -210,8 +215,14 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     scatter = np.sqrt(np.square(residual[used]).sum(axis=0) / freedom)
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
     known = slice(1 + effective.shape[1])
-    free, gains = basis_of(whole[used, known]), solution[known][1:] / scatter
-    unknown, left = without(fading[used], free), without(values[used] / scatter, free)
+    gains = solution[known][1:] / scatter
+    # A step of unknown size makes the errors of all maps of its part correlated; `within` makes them independent again.
+    shown, number = steps[used], np.maximum(steps[used].sum(axis=0), 1.0)
+    kept = 1.0 / np.sqrt(1.0 + number * (FIGURE_STEP / scatter[0]) ** 2)
+    within = np.eye(len(shown)) - (shown * (1.0 - kept) / number) @ shown.T
+    free = basis_of(within @ whole[used, known])
+    unknown = without(np.tensordot(within, fading[used], 1), free)
+    left = without(within @ (values[used] / scatter), free)
     return weights_of(unknown, left, gains, (1.0, 0.0), np.zeros(fading.shape[1:]))
 
 

@@ -240,12 +240,14 @@ def _result_of(
     response = rms(coefficients[:, terms:], weight)
     grades = quality.grade(response, standard_error, design.excited, rings, options)
     figure_sag = figure[:, terms:]
+    # The figure of a resumed run is that of its last part: it may have changed while the run was interrupted.
+    last = design.matrix[good.segment == good.segment[-1], : design.drift].any(axis=0)
     return InfluenceFit(
         method=options.method,
         influence_zernike=coefficients[:, :terms].T.copy(),
-        zernike_offset=figure[:, :terms].mean(axis=0),
+        zernike_offset=figure[last, :terms].mean(axis=0),
         influence_sag=coefficients[:, terms:].T.copy(),
-        sag_offset=figure_sag.mean(axis=0),
+        sag_offset=figure_sag[last].mean(axis=0),
         points=maps.points,
         signal_min=float(good.applied.min()),
         signal_max=float(good.applied.max()),

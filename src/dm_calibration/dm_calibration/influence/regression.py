@@ -83,7 +83,7 @@ class Regression:
     covariance: Floats
 
 
-def drift_columns(stamp_ns: Ints, reference: Bools, step: Ints) -> Floats:
+def drift_columns(stamp_ns: Ints, reference: Bools, step: Ints, segment: Ints | None = None) -> Floats:
     """(M, R) columns of the design: hat functions of time with a knot at the mean time of each reference state.
 
     Repeated maps of a state, which follow each other, share its knot. Before the first and after the last knot the
@@ -92,7 +92,14 @@ def drift_columns(stamp_ns: Ints, reference: Bools, step: Ints) -> Floats:
 
     Args:
         step: (M,) index of the commanded state.
+        segment: (M,) number that changes where the run was resumed. Each part has knots of its own, since the figure
+            may have changed in between; None = the run was not interrupted.
     """
+    if segment is not None and (segment != segment[0]).any():
+        parts = [segment == number for number in np.unique(segment)]
+        blocks = [drift_columns(stamp_ns[part], reference[part], step[part]) for part in parts]
+        columns = scipy.linalg.block_diag(*blocks)
+        return np.asarray(columns[np.argsort(np.concatenate([np.flatnonzero(part) for part in parts]))])
     if (np.diff(stamp_ns) < 0).any():
         stamp_ns = np.arange(stamp_ns.size, dtype=np.int64)
     knots = np.unique([stamp_ns[reference & (step == state)].mean() for state in np.unique(step[reference])])
@@ -117,7 +124,7 @@ def make_design(maps: MapSet) -> Design:
             f"no actuator was moved by {EXCITATION_MIN:g} or more in the {len(maps)} good maps: raise poke_amplitude, "
             "or add surfaces that move the actuators"
         )
-    drift = drift_columns(maps.stamp_ns, maps.reference, maps.step)
+    drift = drift_columns(maps.stamp_ns, maps.reference, maps.step, maps.segment)
     if len(maps) < drift.shape[1] + count + DRIFT_SPARE_MAPS:
         drift = np.ones((len(maps), 1))
     unknowns = drift.shape[1] + count

@@ -55,7 +55,7 @@ class RunHistory:
         """
         self._maps = maps
         self._sag = fill_gaps(maps.sag, model, maps.points)
-        self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step)
+        self._figure = drift_columns(maps.stamp_ns, maps.reference, maps.step, maps.segment)
         self._radius = np.array((0.0, *PLAY_RADII))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # even if the clock was set back
         moved = np.clip(maps.moved_s(), np.concatenate(([-BEFORE_FIRST_MAP_S], time[:-1])), time)
