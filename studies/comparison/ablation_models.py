@@ -12,7 +12,7 @@ from dm_calibration.influence.fit import FitOptions
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from studies.comparison.compare import CURVATURES
+from dm_tools.running_suite import CURVATURES
 from studies.comparison.driven_mirror import build_recipes
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 

@@ -33,13 +33,12 @@ from dm_controller.planning.mirror_model import InfluenceModel, target_shape
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import PseudoInverse
+from dm_tools.running_suite import CURVATURES
 from dm_tools.verify import SurfaceError, surface_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model, plan_steps
 from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver
 from studies.solvers.steepest_descent import SteepestDescent
 
-#: Curvatures of the sweep, 1/m: the range of [1], section 3.2.
-CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 #: Suffix of the name of a method in the closed loop.
 CLOSED = "_closed_loop"
 #: Methods older than [1]: their influence matrix is from single pokes, without the surfaces of Table 1.

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_common.errors import UnknownNameError
 from dm_controller.converge.closed_loop import LoopOptions
+from dm_tools.running_suite import CURVATURES
 from studies.comparison import compare as study
 from studies.comparison.compare import (
     CLOSED,
-    CURVATURES,
     CompareOptions,
     Comparison,
     Trial,

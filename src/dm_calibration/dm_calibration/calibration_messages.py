@@ -83,8 +83,11 @@ def put_updates(
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    errors = [kept.filter.warm_error(drift, temperature), kept.filter.stuck_error(drift)]
-    errors.append(kept.filter.drift_error(drift, age_s))
+    errors = (
+        kept.filter.warm_error(drift, temperature),
+        kept.filter.stuck_error(drift),
+        kept.filter.drift_error(drift, age_s),
+    )
     for promise in (message, message.hysteresis):  # no bound falls below the disagreement of maps since one last agreed
         held_out = math.sqrt(drift.excess) * promise.held_out_max_zernike
         promise.held_out_max_zernike = math.hypot(max(held_out, drift.disagreement), *errors)

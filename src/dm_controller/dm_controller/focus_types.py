@@ -119,9 +119,11 @@ class Order:
         last, other = self.command, self.earlier
         if last is None or other is None or (last.confirmed and other.confirmed):
             return False
-        if followed := same_signals(requested, other.signals):
-            self.command, self.earlier, other.confirmed = other, last, True
-        return followed
+        if not same_signals(requested, other.signals):
+            return False
+        other.confirmed = True
+        self.command, self.earlier = other, last
+        return True
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
         """A command to stay at the present signals (N,), which after quantisation may break a limit by a step."""

@@ -202,7 +202,7 @@ def _crept_before(run: Run, effective: Floats, fading: Floats) -> Floats:
         fading: (M, S, N) share of that creep that is left in each map.
     """
     good, count, values = run.responses.usable, run.responses.coefficients, run.responses.values
-    steps = run.figure[:, 3::2]
+    steps = run.figure[:, 3::2]  # of each part after the first
     whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2), steps))
     for _ in range(OUTLIER_ROUNDS):
         used = good
@@ -216,13 +216,17 @@ def _crept_before(run: Run, effective: Floats, fading: Floats) -> Floats:
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
     known = slice(1 + effective.shape[1])
     gains = solution[known][1:] / scatter
-    # A step of unknown size makes the errors of all maps of its part correlated; `within` makes them independent again.
     shown, number = steps[used], np.maximum(steps[used].sum(axis=0), 1.0)
     kept = 1.0 / np.sqrt(1.0 + number * (FIGURE_STEP / scatter[0]) ** 2)
-    within = np.eye(len(shown)) - (shown * (1.0 - kept) / number) @ shown.T
-    free = basis_of(within @ whole[used, known])
-    unknown = without(np.tensordot(within, fading[used], 1), free)
-    left = without(within @ (values[used] / scatter), free)
+
+    def independent(rows: Floats) -> Floats:
+        """A step of unknown size makes the errors of all maps of its part correlated; here they no longer are."""
+        means = np.tensordot(shown.T, rows, 1)
+        return np.asarray(rows - np.tensordot(shown * (1.0 - kept) / number, means, 1))
+
+    free = basis_of(independent(whole[used, known]))
+    unknown = without(independent(fading[used]), free)
+    left = without(independent(values[used] / scatter), free)
     return weights_of(unknown, left, gains, (1.0, 0.0), np.zeros(fading.shape[1:]))
 
 

@@ -202,6 +202,18 @@ def worst_other_error(displaced: Mapping[int, Displaced], expected: Floats, zern
     return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
 
 
+def noticed_error(displaced: Mapping[int, Displaced], zernike: Floats) -> float:
+    """Coefficient error (m) by actuators that are noticed, which are likely to err as much in other shapes.
+
+    Args as of :func:`worst_other_error`.
+    """
+    away = np.zeros(zernike.shape[1])
+    for actuator, one in displaced.items():
+        if noticed(one):
+            away[actuator] = abs(one.more)
+    return float((np.abs(zernike[PISTON_TILT:]) @ away).max())
+
+
 def noticed(one: Displaced) -> bool:
     """Whether an actuator is surely somewhere else, if only so little that the map agrees."""
     return one.probability >= SURE and abs(one.more) >= NOTICED

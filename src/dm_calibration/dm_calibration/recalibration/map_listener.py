@@ -107,8 +107,8 @@ class MapListener:
         self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
         self._published_age_s = self._age_s
         if (kept := self._updates.in_use) is not None:
-            said = self._temperatures.published(), self._doubts(), self._updates.mirror_changed
-            put_updates(message, kept, *said, self._published_age_s)
+            temperature, doubts = self._temperatures.published(), self._doubts()
+            put_updates(message, kept, temperature, doubts, self._updates.mirror_changed, self._published_age_s)
 
     @property
     def recipes_in_doubt(self) -> bool:

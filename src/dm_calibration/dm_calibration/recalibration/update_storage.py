@@ -19,7 +19,8 @@ SCHEMA_VERSION = 1
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
-#: Figures missing in older files, with values that give a trust of exactly 1, with which those updates were used.
+#: Names of the evidence, missing in older files, with values that give a trust of exactly 1, with which those updates
+#: were used; and figures missing in older files, with what they were then.
 _EVIDENCE = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0}
 _FIGURES = {"disagreement": 0.0, "misfit": 1.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")

@@ -18,14 +18,19 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_comparison import other_aperture, other_setup
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import described, noticed, without_response, worst_other_error
+from dm_calibration.recalibration.displaced import (
+    described,
+    noticed,
+    noticed_error,
+    without_response,
+    worst_other_error,
+)
 from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
 from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
 from dm_common.measurement import Measurement
-from dm_common.optics.zernike import PISTON_TILT
 
 #: Time within which all maps of a mirror that has not moved share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
@@ -193,10 +198,8 @@ class RecalibrationManager:
             if dry_run:
                 return Verdict(accepted, reason, comparison)
             if accepted:
-                # An actuator that begins to fail is likely to err as much in other shapes.
-                away = {index: abs(one.more) for index, one in comparison.displaced.items() if noticed(one)}
-                effects = np.abs(calibration.fit.influence_zernike[PISTON_TILT:, list(away)]) @ list(away.values())
-                changed = replace(comparison.updated, disagreement=float(effects.max()))
+                begins = noticed_error(comparison.displaced, calibration.fit.influence_zernike)
+                changed = replace(comparison.updated, disagreement=begins)
                 kept = replace(kept, repeats=repeat + 1)
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)

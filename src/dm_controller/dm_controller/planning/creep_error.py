@@ -121,9 +121,11 @@ class CreepError:
         unseen += np.square((since * faded) @ self._unseen.T)
         shared += unseen
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
-        then_s = max((measured or 0.0) - self._law.crept_at, IN_FIGURE_S)
+        # Old creep counts from when the figure holds, or from when the recipe was measured, if that was later.
+        begin = max((measured or 0.0) - self._law.crept_at, IN_FIGURE_S)
         at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
-        fade = np.exp(-np.maximum(at, 0.0 if measured is None else then_s)[:, None] / time) - np.exp(-then_s / time)
+        at = np.maximum(at, 0.0 if measured is None else begin)
+        fade = np.exp(-at[:, None] / time) - np.exp(-begin / time)
         each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
         each = each @ np.square(self._rows).T
         count = self._coefficients
