@@ -5,13 +5,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any
 
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError, SettledState
 from dm_common.hysteresis.creep_record import CreepRecord, record_of
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
-from dm_common.messages import taken
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
@@ -122,13 +120,13 @@ class DrivenMirror:
 
     def plan(self, target: FocusTarget) -> Move:
         """The move to `target` from the present state; with recipes, the mirror is degaussed first, and one is used."""
-        recipe: dict[str, Any] = {}
+        recipe = None
         if self._corrections is not None:
-            recipe = taken(self._corrections.find(target), "effective", "error", "built")
+            recipe = self._corrections.find(target)
             self.bench.degauss()
         self._follow()
         state, known = self._tracker.state, not self._tracker.unknown
-        return self._planner.plan(target, state, self.bench.time, known, ahead=SETTLE_S, **recipe)
+        return self._planner.plan(target, state, self.bench.time, known, recipe, SETTLE_S)
 
     def go(self, move: Move) -> Move:
         """Carry out `move`, which holds the prediction made beforehand.

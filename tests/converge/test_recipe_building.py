@@ -22,7 +22,7 @@ from dm_controller.converge.recipe_building import (
 )
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.recipes import Corrections, UnreachableError, recipe_targets
+from dm_controller.planning.recipes import Corrections, FoundRecipe, UnreachableError, recipe_targets
 from dm_controller.planning.target import FocusTarget, Shape
 from linear_mirror import hexagon
 from linear_plant import LIMITS, MODEL, LinearPlant
@@ -61,7 +61,7 @@ class Rig:
         began = bench.time
         bench.degauss()
         state = law.advance(law.degaussed(state, began), bench.time)
-        move = self.loop.plan(target, state, bench.time, effective=effective, ahead=0.5)
+        move = self.loop.plan(target, state, bench.time, recipe=FoundRecipe(effective), ahead=0.5)
         state = law.move(state, bench.apply(move.plan.signals), bench.time)
         bench.time += 0.5
         return true_error(bench, target).max_zernike, state

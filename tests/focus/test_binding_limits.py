@@ -10,6 +10,7 @@ from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_controller.focus_parameters import REACHABLE_TOLERANCE
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
+from dm_controller.planning.recipes import FoundRecipe
 from dm_controller.planning.target import FocusTarget
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from focus_bench import calibration, calibration_with_history, make_law, mirror_info
@@ -128,7 +129,7 @@ def test_a_recipe_beyond_the_limits_is_commanded_inside_them_without_hysteresis_
     inside = plans.mirror.command(FocusTarget(0.05))[0]
     state = plans.law.demagnetised(ACTUATORS, 0.0)
     for share in (1.0, 4.0):
-        move = plans.plan(FocusTarget(0.05), state, 0.0, effective=share * inside, error=1e-9)
+        move = plans.plan(FocusTarget(0.05), state, 0.0, recipe=FoundRecipe(share * inside, 1e-9))
         assert plans.mirror.limits.allow(move.signals)
         assert (share * inside == move.signals).all() == (move.max_zernike <= 1e-9) == (share == 1.0)
 
@@ -137,7 +138,7 @@ def test_what_a_recipe_corrects_is_no_error_that_limits_leave() -> None:
     plans, target = active_calibration(calibration(), mirror_info()).planner, FocusTarget(0.03)
     corrected = plans.mirror.command(target)[0] + 0.02 * np.random.default_rng(1).standard_normal(ACTUATORS)
     assert plans.mirror.predict(target, corrected).max_zernike > 20e-9
-    move = plans.plan(target, plans.law.demagnetised(ACTUATORS, 0.0), 0.0, effective=corrected, error=40e-9)
+    move = plans.plan(target, plans.law.demagnetised(ACTUATORS, 0.0), 0.0, recipe=FoundRecipe(corrected, 40e-9))
     np.testing.assert_array_equal(move.signals, corrected)
     assert move.max_zernike == pytest.approx(move.plan.max_zernike) and move.max_zernike < 0.1e-9
     assert move.plan.max_zernike_upper >= 40e-9 - 0.1e-9 and not move.plan.saturated.any()

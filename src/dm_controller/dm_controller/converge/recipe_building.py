@@ -21,7 +21,7 @@ from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
 from dm_controller.converge.defects import Defects, agreeing_maps, mean_of
 from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import Corrections, UnreachableError, target_of
+from dm_controller.planning.recipes import Corrections, FoundRecipe, UnreachableError, target_of
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Shape, measured_shape, rms_sag
 
@@ -195,16 +195,16 @@ class RecipeBuilder:
         Returns:
             (N,) signals written, and (N,) the effective signals to keep: `aim`, or what the limits allow instead.
         """
-        law, plant = self._loop.law, self._plant
+        law, plant, settle_time = self._loop.law, self._plant, self._options.settle_time
         self._stop_if_cancelled()
         began = self._now()
         plant.degauss()
         # During the swings about the middle, creep follows the middle.
         self.state = law.advance(law.degaussed(self.state, began, self._middle), self._now())
-        move = self._loop.plan(target, self.state, self._now(), effective=aim, ahead=self._options.settle_time)
+        move = self._loop.plan(target, self.state, self._now(), recipe=FoundRecipe(aim), ahead=settle_time)
         applied = plant.apply(move.signals)
         self.state = law.move(self.state, applied, self._now())
-        missed = law.effective(law.advance(self.state, self._now() + self._options.settle_time)) - aim
+        missed = law.effective(law.advance(self.state, self._now() + settle_time)) - aim
         worst, denied = int(np.abs(missed).argmax()), response(self._loop.mirror.model, missed).max_zernike
         if denied > self._options.reachable:
             raise UnreachableError(

@@ -7,7 +7,6 @@ from dm_msgs.msg import FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import ActuatorEstimate
-from dm_common.messages import taken
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
@@ -126,7 +125,7 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
         begin,
         estimate.known,
         ahead=context.settle,
-        **(taken(recipe, "effective", "error", "built") if recipe is not None else {}),
+        recipe=recipe,
     )
     return replace(move, duration=degauss.wait + move.duration, degauss=None if degauss.begun else degauss.steps)
 

@@ -27,6 +27,7 @@ from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
     from dm_controller.planning.creep_error import CreepBound, CreepError, CreepShown
+    from dm_controller.planning.recipes import FoundRecipe
 
 #: Time at which a shape is to be right unless configured otherwise, s after the end of the move.
 SETTLE_S = 0.05
@@ -123,27 +124,23 @@ class Planner:
         state: HysteresisState | None,
         time: float,
         known: bool = True,
-        effective: Floats | None = None,
+        recipe: FoundRecipe | None = None,
         ahead: float = 0.0,
-        error: float | None = None,
-        built: float = 0.0,
     ) -> Move:
         """The move to `target` that begins at `time` (s) from `state`.
 
         Args:
             state: None = entirely unknown; the mirror is then taken to be degaussed, after shapes held unobserved.
             known: whether the state can be trusted; if not, the bounds are widened.
-            effective: (N,) effective signals to aim at instead of the model's own (a recipe).
+            recipe: effective signals to aim at instead of the model's own.
             ahead: s after the end of the move at which the shape is to be right; creep is quickest just after a move.
-            error: m, 95 % bound of the largest coefficient error under `effective`, as measured.
-            built: s, when it was measured; 0 = not known.
 
         Raises:
             TargetError: no such surface exists over the aperture.
         """
         mirror, law = self.mirror, self.law
-        cut, own = False, None
-        if effective is None:
+        cut, own, error = False, None, None
+        if recipe is None:
             found = self._closed_form.find(target)
             aim, largest = found or mirror.command(target)
             # The limits are those of signals, not of effective ones: from this state more or less may be in reach.
@@ -151,9 +148,9 @@ class Planner:
         else:
             # A recipe corrects an error of the model, so the expected error is only what the limits leave with the
             # model's own signals, plus what they deny of the recipe's signals.
-            aim, (own, largest) = effective, mirror.command(target)
-        if error is not None:
-            largest = min(largest, error)
+            aim, (own, largest) = recipe.effective, mirror.command(target)
+            if math.isfinite(recipe.error):
+                error, largest = recipe.error, min(largest, recipe.error)
         if state is None:
             middle, known, travel = mirror.limits.middle, False, 0.0
             state = rested(law, np.full(len(aim), middle), time, middle)
@@ -161,11 +158,11 @@ class Planner:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         begun, arrival = state, time + travel  # older creep goes on during the move
         signals, residual = aim, None
-        if self.hysteresis is not None or effective is not None:
-            signals, residual = self._inverted(begun, arrival, aim, ahead, target if effective is None else None, cut)
+        if self.hysteresis is not None or recipe is not None:
+            signals, residual = self._inverted(begun, arrival, aim, ahead, target if recipe is None else None, cut)
         reached = aim
         if residual is not None and np.abs(residual).max() > RESIDUAL_MAX:
-            if effective is None:
+            if recipe is None:
                 reached = aim - residual
                 largest = mirror.predict(target, reached).max_zernike
             else:
@@ -179,7 +176,8 @@ class Planner:
             creep = None
             if law.creep_rate:
                 at = law.advance(begun, arrival)
-                position, measured = law.position_at(at, signals), None if error is None else built
+                position = law.position_at(at, signals)
+                measured = recipe.built if recipe is not None and error is not None else None
                 creep = self._creep_error.bound(at, position, ahead, measured)
             return self._bounded(plan, signals, known, creep, error)
 

@@ -47,14 +47,14 @@ class FoundRecipe:
 
     Attributes:
         effective: (N,) effective signals.
-        error: m, bound of the largest coefficient error without creep: as re-measured at the recipes used, plus the
-            possible change of the correction away from them.
+        error: m, 95 % bound of the largest coefficient error without creep: as re-measured at the recipes used, plus
+            the possible change of the correction away from them; infinite = not measured.
         built: s, when the run that built the oldest of the recipes used had ended; 0 = not known.
     """
 
     effective: Floats
-    error: float
-    built: float
+    error: float = math.inf
+    built: float = 0.0
 
 
 class Kriging:
