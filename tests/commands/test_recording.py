@@ -37,6 +37,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
+from sensor_msgs.msg import Image
 from typer.testing import CliRunner
 
 from dm_calibration.calibration_messages import calibration_message
@@ -513,6 +514,30 @@ def test_a_failure_of_the_writer_is_told(
         with Recorder(tmp_path / "bag", domain=domain):
             assert failed.wait(60)
     assert BagReader(tmp_path / "bag").unfinished == []
+
+
+def test_messages_that_come_faster_than_they_can_be_written_are_counted(
+    observer: Observer, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And do not fill the memory."""
+    go_on, write = threading.Event(), BagWriter.write
+
+    def waits(bag: BagWriter, *message: Any) -> None:
+        go_on.wait(60)
+        write(bag, *message)
+
+    monkeypatch.setattr(BagWriter, "write", waits)
+    monkeypatch.setattr("dm_tools.recording.recorder.WAITING_MAX", 1_000_000)
+    images = observer.node.create_publisher(Image, "image_raw", 10)
+    with Recorder(tmp_path / "bag", topics=["image_raw"], domain=domain) as recorder:
+        wait_until(images.get_subscription_count, 60)
+        for _ in range(10):
+            images.publish(Image(data=bytes(300_000)))
+        wait_until(lambda: recorder.refused, 60)
+        time.sleep(0.5)
+        go_on.set()
+    assert recorder.counts["/image_raw"] + int(recorder.refused["/image_raw"].split()[0]) == 10
+    assert 1 <= recorder.counts["/image_raw"] <= 4
 
 
 def test_another_reader_decodes_it_from_the_definitions_in_the_file(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import queue
@@ -32,6 +33,8 @@ DISCOVERY_PERIOD_S = 0.25
 RETRY_S = 5.0
 #: Messages that a subscription holds while the writer is busy.
 DEPTH = 100
+#: Bytes that may wait for the writer; messages beyond are lost, and counted.
+WAITING_MAX = 500_000_000
 #: Longest sleep of the executor, s; only bounds how soon it ends.
 SPIN_S = 0.1
 #: The writer flushes after this time without a message, s; with `FLUSH_NS` no message waits longer than five seconds.
@@ -53,6 +56,9 @@ class Recorder:
         maps: whether to record the maps themselves.
         domain: ROS domain; None = the environment's.
 
+    Attributes:
+        refused: topics not recorded, or not every message of them, with the reason.
+
     Raises:
         FileExistsError, OSError: the recording cannot be written.
     """
@@ -70,6 +76,7 @@ class Recorder:
         self._wanted = {name if name.startswith("/") else self._namespace + name for name in topics}
         self._maps = maps
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()  # of the writer; None = the end
+        self._received, self._written = 0, 0  # bytes; each is counted in one thread only
         self._failure: Exception | None = None
         self._stopping = False
         # Times are of a clock that is never set: messages keep their order.
@@ -169,8 +176,14 @@ class Recorder:
             self.refused[name] = str(error)
             return
 
+        lost = itertools.count(1)
+
         def take(data: bytes) -> None:
-            self._jobs.put(partial(self._bag.write, name, data, self._now_ns()))
+            if self._received - self._written > WAITING_MAX:
+                self.refused[name] = f"{next(lost)} messages: they come faster than they can be written"
+                return
+            self._received += len(data)
+            self._jobs.put(partial(self._keep, name, data, self._now_ns()))
 
         profile = profile_for(topic, DEPTH, all(offer.reliability.name == "RELIABLE" for offer in offers))
         self._node.create_subscription(message_class(type_name), name, take, profile, raw=True)
@@ -217,6 +230,10 @@ class Recorder:
         client.get_parameter_types(names).add_done_callback(fetch)
 
     # --- in the writer's thread ---
+
+    def _keep(self, name: str, data: bytes, time_ns: int) -> None:
+        self._bag.write(name, data, time_ns)
+        self._written += len(data)
 
     def _write(self) -> None:
         """Write what arrives; compression must not hold up the executor."""
