@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.excitation import CHECK_SHARE, FLAT_KNOWN, MAPS_MIN, excitation, next_part
+from dm_calibration.hysteresis.identify import check_excitation
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.run import Run
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from linear_mirror import make_mirror
@@ -32,6 +35,15 @@ def test_every_actuator_turns_over_a_wide_swing(difference: float) -> None:
     change = np.diff(signals, axis=0)
     assert ((change[1:] * change[:-1] < 0.0).sum(axis=0) >= 50).all()
     assert (np.ptp(signals, axis=0) > 1.5).all()
+
+
+def test_actuators_that_move_one_after_the_other_turn_too() -> None:
+    steps = np.random.default_rng(4).uniform(-1.0, 1.0, (160, 4))
+    signals = np.zeros_like(steps)
+    for row in range(1, 160):
+        signals[row] = np.where(np.arange(4) == row % 4, steps[row], signals[row - 1])
+    run = Run(signals, np.arange(160.0), Responses(np.zeros((160, 3)), 3, np.ones(160, dtype=bool)))
+    assert check_excitation(run) == ()
 
 
 def test_the_last_moves_are_checks() -> None:

@@ -273,9 +273,8 @@ def check_excitation(run: Run) -> tuple[int, ...]:
         raise ExcitationError(
             f"{usable} usable maps: the hysteresis of {actuators} actuators needs at least {needed}; take 100 to 400"
         )
-    change = np.diff(run.signals, axis=0)
-    change = change[change.any(axis=1)]  # a shape may be measured several times
-    turns = (change[1:] * change[:-1] < 0.0).sum(axis=0)
+    ways = np.sign(np.diff(run.signals, axis=0)).T  # 0 while an actuator stands still, perhaps between two ways
+    turns = np.array([np.count_nonzero(np.diff(way[way != 0.0])) for way in ways])
     swing = np.ptp(run.signals, axis=0)
     quiet = np.flatnonzero((turns < TURNS_MIN) | (swing < SWING_MIN))
     if quiet.size == actuators or quiet.size > max(1, int(QUIET_SHARE * actuators)):
