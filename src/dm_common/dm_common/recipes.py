@@ -88,6 +88,8 @@ class RecipeBook:
             count, known = len(recipe.effective), np.concatenate((recipe.effective, recipe.by_model))
             if len(recipe.signals) != count or len(known) not in (count, 2 * count) or not np.isfinite(known).all():
                 raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
+            if not 0.0 <= recipe.max_zernike < np.inf:
+                raise RecipeError(f"recipe: max_zernike = {recipe.max_zernike:g} m: must be finite and not negative")
 
     def check_condition(self, degauss_steps: int) -> None:
         """Raise RecipeError if these recipes begin with a degauss of another number of half-swings."""

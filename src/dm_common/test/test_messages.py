@@ -138,3 +138,5 @@ def test_recipes_that_do_not_fit_together_are_refused() -> None:
         RecipeBook((replace(recipe(-0.01), by_model=np.zeros(3)),), 100, 0.0)
     with pytest.raises(RecipeError, match="different numbers of actuators"):
         RecipeBook((recipe(-0.01), recipe(0.02, actuators=3)), 100, 0.0)
+    with pytest.raises(RecipeError, match="max_zernike = nan m: must be finite and not negative"):
+        RecipeBook((replace(recipe(-0.01), max_zernike=np.nan),), 100, 0.0)

@@ -816,6 +816,16 @@ def test_a_recipe_follows_its_degauss(bench: Bench) -> None:
     assert health(bench.controller, VALUES, bench.now).values["conditioned"] is False
 
 
+@pytest.mark.parametrize("fields", [{"curvature": np.nan}, {"curvature": 200.0}, {"zernike": [1e-7]}])
+def test_recipes_of_no_surface_are_no_calibration(bench: Bench, fields: dict[str, Any]) -> None:
+    nowhere = doubles(np.zeros(ACTUATORS))
+    book = RecipeBook(calibration_id="known", recipes=[Recipe(effective=nowhere, signals=nowhere, **fields)])
+    bench.do(bench.controller.use(calibration(), MIRROR, book))
+    told = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
+    assert told.error_code == ErrorCode.CALIBRATION_UNREADABLE
+    assert f"recipes: {next(iter(fields))}" in told.message
+
+
 # --- the driver ---
 
 

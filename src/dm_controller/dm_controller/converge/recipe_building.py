@@ -268,9 +268,9 @@ def recipe_book(
     Raises:
         RecipeError: the recipes `before` begin with another degauss.
     """
-    known = [
-        replace(recipe, by_model=loop.mirror.command(target_of(recipe))[0], stamp_ns=stamp_ns) for recipe in recipes
-    ]
+    radius = loop.mirror.model.aperture_radius
+    models = [loop.mirror.command(target_of(recipe, radius))[0] for recipe in recipes]
+    known = [replace(recipe, by_model=own, stamp_ns=stamp_ns) for recipe, own in zip(recipes, models, strict=True)]
     ordered = sorted(known, key=lambda recipe: recipe.shape)
     book = RecipeBook(tuple(ordered), degauss_steps, 0.0)
     whole = before.merged(book)

@@ -20,7 +20,7 @@ from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.recipes import Corrections
+from dm_controller.planning.recipes import Corrections, target_of
 from dm_controller.planning.target import FocusTarget
 
 NO_DRIVER = "no mirror_info from pdm_driver yet"
@@ -148,6 +148,8 @@ def active_calibration(
         book = recipe_book_from(recipes) if own else NO_RECIPES
         if any(len(recipe.effective) != calibration.actuators for recipe in book.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
+        for recipe in book.recipes:
+            target_of(recipe, model.aperture_radius)
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         worst_case = calibrated
         if not planner.law.is_identity:

@@ -91,8 +91,7 @@ class Corrections:
             too. Recipes built later stay as measured, even if earlier updates are lost.
 
     Raises:
-        RecipeError: there are none.
-        Refusal: one has an invalid shape, naming its field.
+        RecipeError: there are none, or as `target_of`.
 
     Attributes:
         amplitude: m, bound of the largest coefficient of a correction where no recipe is near.
@@ -102,9 +101,7 @@ class Corrections:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
-        shapes = [target_of(recipe) for recipe in recipes]
-        for shape in shapes:
-            TARGET.check(shape)
+        shapes = [target_of(recipe, planner.mirror.model.aperture_radius) for recipe in recipes]
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._effective = np.array([recipe.effective for recipe in recipes])
         now = [planner.mirror.command(shape)[0] for shape in shapes]
@@ -210,9 +207,15 @@ class UnreachableError(CodedError, RecipeError):
     error_code = ErrorCode.UNREACHABLE
 
 
-def target_of(recipe: Recipe) -> FocusTarget:
-    """The shape that a recipe makes."""
-    return FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike)
+def target_of(recipe: Recipe, radius: float) -> FocusTarget:
+    """The shape that a recipe makes. Raises RecipeError if there is none such over an aperture of `radius` (m)."""
+    target = FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike)
+    try:
+        TARGET.check(target)
+        target.check_aperture(radius)
+    except Refusal as error:
+        raise RecipeError(f"recipes: {error}") from error
+    return target
 
 
 def recipe_targets(
