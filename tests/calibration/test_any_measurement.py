@@ -15,6 +15,7 @@ import pytest
 
 from dm_calibration import identify_response
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
+from dm_calibration.hysteresis.features import play_values
 from dm_calibration.hysteresis.identify import ExcitationError
 from dm_common import Floats
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
@@ -84,6 +85,19 @@ def test_more_numbers_than_measurements_change_nothing() -> None:
     assert whole.held_out["linear"] == pytest.approx(ours.held_out["linear"], rel=1e-6)
     assert whole.influence.shape == (19, measured.shape[1])
     np.testing.assert_allclose(whole.predict(commands, times).shape, measured.shape)
+
+
+def test_the_noise_of_many_values_does_not_hide_hysteresis() -> None:
+    rng = np.random.default_rng(7)
+    commands = rng.uniform(-1.0, 1.0, (160, 3))
+    effective = commands + 0.06 * play_values(commands, np.linspace(0.1, 0.7, 4)).sum(axis=1)
+    measured = effective @ np.exp(-np.square((np.linspace(-1.0, 1.0, 300) - [[-0.6], [0.0], [0.6]]) / 0.3))
+    noisy = measured + 0.2 * measured.std() * rng.standard_normal(measured.shape)
+    found = identify_response(commands, noisy, candidates=(CANDIDATES[0], CANDIDATES[2]))
+    assert found.name == "Prandtl-Ishlinskii" and found.held_out[found.name] == pytest.approx(0.2, rel=0.05)
+    noisy[9, ::2] += 3.0 * measured.std()  # in no pattern of the actuators
+    noisy[9, 1::2] -= 3.0 * measured.std()
+    assert "no law explains: 10." in identify_response(commands, noisy, candidates=CANDIDATES[:1]).remark
 
 
 def test_an_actuator_that_never_moves_is_named() -> None:

@@ -15,7 +15,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses, agreeing
-from dm_calibration.hysteresis.run import Run, start_of
+from dm_calibration.hysteresis.run import Run, basis_of, start_of, without
 from dm_common import Bools, Floats
 from dm_common.hysteresis.model import HysteresisModel
 
@@ -135,19 +135,25 @@ def identify_response(
         raise ValueError("candidates: must be at least one law, the first of them common to all actuators")
     _check_apart(signals)
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
-    if brought.shape[1] > len(brought):
-        # Fewer values per row with the same sums of squares.
-        brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
-    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), start_of(shapes), shapes)
+    # N actuators make at most N patterns; elsewhere is only noise, which would hide the differences between laws.
+    linear = np.column_stack((np.ones(len(signals)), signals))[usable]
+    patterns: Floats = np.linalg.qr(np.linalg.lstsq(linear, brought[usable], rcond=None)[0][1:].T)[0]
+    seen: Floats = brought @ patterns
+    run = Run(signals, seconds, Responses(seen, seen.shape[1], usable), start_of(shapes), shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
-    signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
-    error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)
+    free = basis_of(np.hstack((run.figure, signals))[usable])
+    count, used = free.shape
+    elsewhere = np.zeros_like(brought)
+    elsewhere[usable] = without((brought - seen @ patterns.T)[usable], free)
+    noise = np.square(elsewhere).sum() * count / (count - used) ** 2
+    error = np.nanmean(np.square(found.held_out), axis=0).sum()
+    signal = brought[usable].var(axis=0).sum()
     law = found.fit.law
     middle = seconds - seconds.mean()
     design = np.column_stack((np.ones(len(signals)), middle / np.ptp(middle), run.follow(law)))
     solution = np.linalg.lstsq(design[usable], values[usable], rcond=1e-10)[0]
     remarks = [found.quiet_remark] if found.quiet else []
-    if (odd := usable & ~agreeing(usable, found.closest)).any():
+    if (odd := usable & ~agreeing(usable, np.hstack((found.closest, elsewhere)))).any():
         rows = ", ".join(map(str, np.flatnonzero(odd) + 1))
         remarks.append(f"Rows that no law explains: {rows}. Measurements that failed or were lost must be rows of NaN.")
     if law.has_history and signals.min() >= 0.0:
@@ -160,7 +166,7 @@ def identify_response(
         influence=solution[2:],
         figure=solution[0],
         drift=solution[1],
-        held_out={name: error * score for name, score in found.scores.items()},
+        held_out={name: float(np.sqrt((error * score**2 + noise) / signal)) for name, score in found.scores.items()},
         measurements=int(usable.sum()),
         remark="\n".join(remarks),
     )
