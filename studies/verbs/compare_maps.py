@@ -47,6 +47,7 @@ def row_of(judged: Sequence[Any], method: str, maps: int) -> dict[str, Any]:
         "worst_nm": max(reached, default=None),
         "good": sum(value <= 1e9 * GOAL for value in reached),
         "inside": min((one.requests.coverage for one in served), default=None),
+        "refused": sum(len(one.requests.refusals) for one in served),
         "failures": {one.seed: one.failure or one.requests.refusals[0] for one in judged if one not in served},
     }
 
@@ -56,7 +57,8 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
     from rich.table import Table
 
     table = Table(title="largest coefficient error of 95 % of the moves, 1 s each, on the true surface")
-    for heading in ("maps", "method", "s", "median mirror", "", "worst", "within λ/200", "lowest inside", "none"):
+    figures = ("s", "median mirror", "", "worst", "within λ/200", "lowest inside", "refused", "none")
+    for heading in ("maps", "method", *figures):
         table.add_column(heading, justify="left" if heading == "method" else "right")
     for row in rows:
         reached, judged = row["median_nm"], len(row["p95_nm"])
@@ -68,6 +70,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
             f"{row['worst_nm']:.1f} nm" if judged else "",
             f"{row['good']} of {judged + len(row['failures'])}",
             f"{row['inside']:.0%}" if judged else "",
+            str(row["refused"]) if judged else "",
             str(len(row["failures"]) or ""),
         )
     console.print(table)

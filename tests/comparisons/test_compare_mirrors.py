@@ -111,11 +111,13 @@ def test_pokes_of_as_many_maps_and_what_is_told_of_each_number(capsys: pytest.Ca
         signals = patterns(method, mirror, 130)
         assert all(mirror.limits.allow(row) for row in signals)
         assert np.linalg.matrix_rank(np.column_stack((np.ones(80), signals[:80]))) == 1 + mirror.actuators
-    errors = Requests(np.full(20, 2e-9), np.full(20, 3e-9), np.ones(20))
+    errors = Requests(np.full(20, 2e-9), np.full(20, 3e-9), np.ones(20), ("out of reach",) * 7)
     judged = FewMaps(1, HADAMARD, 60, 60, 64.0, errors)
     short = judge_few_maps(3, PUSH_PULL, 1, pixels=100)
     assert short.failure and not len(short.requests.error)
     row = row_of_method([judged, short], HADAMARD, 60)
     assert (row["median_nm"], row["good"], row["failures"]) == (pytest.approx(2.0), 1, {3: short.failure})
+    assert row["refused"] == 7  # inside the range that the calibration published: they do not vanish
     show_maps([row])
-    assert "1 of 2" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "1 of 2" in shown and "refused" in shown
