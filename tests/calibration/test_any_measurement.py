@@ -95,6 +95,8 @@ def test_the_noise_of_many_values_does_not_hide_hysteresis() -> None:
     noisy = measured + 0.2 * measured.std() * rng.standard_normal(measured.shape)
     found = identify_response(commands, noisy, candidates=(CANDIDATES[0], CANDIDATES[2]))
     assert found.name == "Prandtl-Ishlinskii" and found.held_out[found.name] == pytest.approx(0.2, rel=0.05)
+    even = np.square(commands) @ np.linalg.qr(measured.T)[0][:, :3].T  # no linear response at all
+    assert identify_response(commands, even, candidates=STATIC[:2]).held_out["squares"] < 1e-6
     noisy[9, ::2] += 3.0 * measured.std()  # in no pattern of the actuators
     noisy[9, 1::2] -= 3.0 * measured.std()
     assert "no law explains: 10." in identify_response(commands, noisy, candidates=CANDIDATES[:1]).remark

@@ -136,8 +136,9 @@ def identify_response(
     _check_apart(signals)
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
     # N actuators make at most N patterns; elsewhere is only noise, which would hide the differences between laws.
-    linear = np.column_stack((np.ones(len(signals)), signals))[usable]
-    patterns: Floats = np.linalg.qr(np.linalg.lstsq(linear, brought[usable], rcond=None)[0][1:].T)[0]
+    powers = np.hstack((np.ones((len(signals), 1)), signals, np.square(signals)))[usable]
+    response = powers[:, 1:] @ np.linalg.lstsq(powers, brought[usable], rcond=None)[0][1:]
+    patterns: Floats = np.linalg.svd(response, full_matrices=False)[2][: signals.shape[1]].T
     seen: Floats = brought @ patterns
     run = Run(signals, seconds, Responses(seen, seen.shape[1], usable), start_of(shapes), shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
