@@ -85,6 +85,7 @@ def test_commands_without_a_map_stay_in_the_history() -> None:
     assert gappy.maps == whole.maps - len(blind)
     assert 0.5 < gappy.held_out_max_zernike / whole.held_out_max_zernike < 2.0
     assert any("excitation 30" in remark for remark in gappy.remarks)
+    assert hysteresis_fit.NO_DEGAUSS not in gappy.remarks
 
 
 def test_a_range_that_is_not_symmetric_is_as_good() -> None:

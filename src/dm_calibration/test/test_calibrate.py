@@ -20,7 +20,7 @@ from dm_calibration.acquisition.map_sources import outcome_of
 from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
-from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
+from dm_calibration.hysteresis.hysteresis_fit import NO_DEGAUSS, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.optics.aperture import InsufficientDataError
@@ -216,6 +216,7 @@ def test_arrays_of_commands_times_and_maps(
     left_out = [text[:25] for text in made["calibration"].dropped]  # type: ignore[attr-defined]
     assert left_out == ["map 1: 0 valid pixels ins", "map 8: 0 valid pixels ins"]
     known = made["calibration"].hysteresis  # type: ignore[attr-defined]
+    assert NO_DEGAUSS in made["calibration"].limitations  # type: ignore[attr-defined]
     assert known.held_out_max_zernike < 0.3e-9
     assert known.law.creep_rate == pytest.approx(0.01, rel=0.2)
     left = made["left"]
