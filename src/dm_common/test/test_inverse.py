@@ -35,12 +35,13 @@ def test_the_law_of_the_inverse_is_what_was_wanted(law: HysteresisModel, turns: 
         np.testing.assert_array_equal(found.residual, 0.0)
 
 
+@pytest.mark.parametrize("ahead", [0.0, 100.0])
 @pytest.mark.parametrize("law", LAWS)
-def test_a_limit_stops_it_and_tells_what_is_missed(law: HysteresisModel) -> None:
+def test_a_limit_stops_it_and_tells_what_is_missed(law: HysteresisModel, ahead: float) -> None:
     state = law.demagnetised(3, 0.0)
-    found = invert(law, state, np.array([5.0, -5.0, 0.1]), -0.5, 0.6)
+    found = invert(law, state, np.array([5.0, -5.0, 0.1]), -0.5, 0.6, ahead)
     np.testing.assert_allclose(found.signals[:2], [0.6, -0.5])
-    reached = law.effective(law.move(state, found.signals, 0.0))
+    reached = law.effective_at(state, found.signals, ahead)
     np.testing.assert_allclose(found.residual, [5.0 - reached[0], -5.0 - reached[1], 0.0], atol=1e-7)
 
 

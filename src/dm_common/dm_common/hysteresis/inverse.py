@@ -80,7 +80,7 @@ def invert(
     if not inverted.residual.any():
         return inverted
     # A limit may lie before the onset of the piece that holds the solution: the law itself gives what is missed.
-    residual = np.where(inverted.residual, wanted - law.position_at(state, inverted.signals), 0.0)
+    residual = np.where(inverted.residual, effective - law.effective_at(state, inverted.signals, ahead), 0.0)
     return Inverted(inverted.signals, residual)
 
 
