@@ -169,6 +169,7 @@ def test_commands_reach_the_wire_and_the_state_tells(driver: Driver) -> None:
 def test_refused_commands_leave_the_wire_alone(driver: Driver) -> None:
     good = np.zeros(37)
     assert driver.set_signals(good, wait=True).error_code == ErrorCode.OK
+    wait_until(lambda: signals_of(driver.unit.frames)[-1] == pytest.approx(0.0, abs=CODE), what="the last frame")
     frames = len(driver.unit.frames)
     nan, outside, neighbours = good.copy(), good.copy(), good.copy()
     nan[4] = np.nan
@@ -375,6 +376,7 @@ def test_a_signal_ramps_to_the_safe_shape(
 
 def test_the_mirror_is_described_again_when_another_driver_of_this_name_has_ended(driver: Driver) -> None:
     node = driver.observer.node
+    wait_until(lambda: driver.infos, what="the driver's own description")
     other = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
     wait_until(lambda: other.get_subscription_count() > 0)
     other.publish(MirrorInfo(serial="another"))

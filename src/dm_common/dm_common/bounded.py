@@ -164,8 +164,6 @@ class BoundedProgramme:
         middle = self.limits.middle
         ends = np.where(signals < middle, self.limits.low, self.limits.high)
         bound = np.abs(signals - ends) < NEAR_LIMIT
-        if bound.all():
-            return signals
         result = self._with_bound(bound & (signals < middle), bound & (signals >= middle), projected)
         return result if self.limits.allow(result) else signals
 

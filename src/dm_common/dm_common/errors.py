@@ -1,4 +1,4 @@
-"""Errors of requests, with the codes that report them. Independent of ROS."""
+"""Errors of requests, with the codes that report them, and what their sentences share. Independent of ROS."""
 
 import difflib
 from collections.abc import Iterable
@@ -98,6 +98,22 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> UnknownNameError
     known_names = f"; known are {', '.join(names[:3])} to {names[-1]}" if names else ""
     hint = f"; did you mean {', '.join(near)}?" if near else known_names
     return UnknownNameError(f"{what} {name!r} is unknown{hint}")
+
+
+def size_text(name: str, size: int) -> str:
+    """The size of an array, as refusals of it begin: signals has 1 value, signals has 36 values."""
+    return f"{name} has {size} value{'' if size == 1 else 's'}"
+
+
+def beside(form: str, value: float, *limits: float) -> str:
+    """A refused value in the format `form`, such as .1%, or with more digits that distinguish it from its `limits`."""
+    limits = tuple(limit for limit in limits if limit != value)  # nothing tells it from these
+    sign, digits = form[:-1].split(".")
+    for more in range(int(digits), 17):
+        text, *others = (f"{number:{sign}.{more}{form[-1]}}" for number in (value, *limits))
+        if text not in others:
+            break
+    return text
 
 
 class ClockError(CodedError, TimeoutError):

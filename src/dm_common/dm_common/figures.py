@@ -1,4 +1,4 @@
-"""Numbers as text: lengths in nanometres or as fractions of a wavelength."""
+"""Numbers as text: lengths in nanometres or as fractions of a wavelength, and counts."""
 
 import math
 from typing import Any
@@ -63,6 +63,11 @@ def accuracy_text(repeatable: float, calibration: Any, curvature: float) -> str:
     }
     limit = max(parts, key=lambda part: parts[part])
     return f"{text}, absolute to {length(math.hypot(*parts.values()))}, limited by {limit}"
+
+
+def counted(count: int, one: str, several: str = "") -> str:
+    """A number with its noun in the singular or plural (`several`, or `one` with an s): no map, 1 map, 5 maps."""
+    return f"{count or 'no'} {one if count <= 1 else several or one + 's'}"
 
 
 def with_point(text: str) -> str:

@@ -5,11 +5,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common import Floats, Ints
+from dm_common import Bools, Floats, Ints
 
-#: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid these are the nearest
-#: six; the next ones are sqrt(3) times that distance away.
-NEIGHBOUR_DISTANCE_RATIO = 1.2
+#: A third actuator stands between two, which are then no neighbours, if they are seen from there at a right angle or a
+#: larger one. By this share the squares of the two sides may exceed that of the distance, so that the diagonals of a
+#: square grid join no neighbours where positions are rounded either.
+RIGHT_ANGLE_SLACK = 0.05
+#: Relative difference of squared distances up to which they count as equal, as those of a ring from its centre are.
+_ROUNDING = 1e-9
 
 
 def ring_count(actuators: int) -> int:
@@ -47,31 +50,28 @@ def hexagonal_positions(
         clockwise: numbers rise clockwise instead of counter-clockwise.
         reflected: the finished pattern is mirrored left-right (x to -x), as when seen from behind.
     """
-    x, y = [np.zeros(1)], [np.zeros(1)]
     corner_angle = np.arange(7) * (math.pi / 3) * (-1.0 if clockwise else 1.0) + start_angle
-    corner_x, corner_y = np.cos(corner_angle), np.sin(corner_angle)
+    corners = np.cos(corner_angle) + 1j * np.sin(corner_angle)
+    places = [np.zeros(1, dtype=np.complex128)]
     for ring in range(1, ring_count(actuators) + 1):
         along = np.arange(ring) / ring  # the sites of a side, from its first corner on
-        for corners, ordinates in ((corner_x, x), (corner_y, y)):
-            sides = corners[:-1, None] + (corners[1:] - corners[:-1])[:, None] * along
-            ordinates.append(ring * pitch * sides.ravel())
-    all_x, all_y = np.concatenate(x), np.concatenate(y)
-    return (-all_x if reflected else all_x), all_y
+        places.append(ring * pitch * (corners[:-1, None] + np.diff(corners)[:, None] * along).ravel())
+    place = np.concatenate(places)
+    return (-place.real if reflected else place.real), place.imag
 
 
 def pitch(x: Floats, y: Floats) -> float:
     """Smallest distance between two actuators, in the unit of the positions (N,)."""
-    return float(_distances(x, y)[1].min())
-
-
-def _distances(x: Floats, y: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """The (P, 2) indices of all pairs, the smaller first, and their (P,) distances."""
-    pairs = np.column_stack(np.triu_indices(x.size, k=1))
-    return pairs, np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]] for places in (x, y)))
+    first, second = np.triu_indices(x.size, k=1)
+    return float(np.hypot(x[first] - x[second], y[first] - y[second]).min())
 
 
 def neighbour_pairs(x: Floats, y: Floats) -> NDArray[np.intp]:
-    """Return the (P, 2) indices, the smaller first, of all pairs closer than 1.2 times the smallest distance.
+    """Return the (P, 2) indices, the smaller first and in rising order, of all pairs without an actuator between them.
+
+    These are the edges of the Gabriel graph: no third actuator lies in the circle whose diameter joins the two. On a
+    hexagonal grid they are the nearest six, on a square grid the nearest four; with several actuators every one has a
+    neighbour, however uneven their distances, and neighbours connect all of them.
 
     Args:
         x, y: (N,) positions in m.
@@ -79,21 +79,33 @@ def neighbour_pairs(x: Floats, y: Floats) -> NDArray[np.intp]:
     Raises:
         ValueError: two actuators at the same place.
     """
-    pairs, distance = _distances(x, y)
-    if len(pairs) == 0:
-        return pairs
-    smallest = distance.min()
-    if smallest <= 0.0:
-        a, b = pairs[distance.argmin()] + 1
-        raise ValueError(f"mirror.actuator_x and mirror.actuator_y: actuators {a} and {b} are at the same place")
-    return pairs[distance < NEIGHBOUR_DISTANCE_RATIO * smallest]
+    places = x + 1j * y
+    pairs: list[tuple[int, int]] = []
+    for actuator in range(x.size):
+        order = np.argsort(np.abs(places - places[actuator]), kind="stable")
+        away = places[order] - places[actuator]  # nearest first, after the actuator itself
+        if x.size > 1 and away[1] == 0.0:
+            a, b = np.sort(order[:2]) + 1
+            raise ValueError(f"mirror.actuator_x and mirror.actuator_y: actuators {a} and {b} are at the same place")
+        left = np.flatnonzero(order > actuator)  # each pair once
+        while left.size:
+            other, left = left[0], left[1:]
+            if not _between(away[1:other], away[other]).any():
+                pairs.append((actuator, int(order[other])))
+            left = left[~_between(away[other], away[left])]
+    return np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
+
+
+def _between(third: NDArray[np.complex128], other: NDArray[np.complex128]) -> Bools:
+    """Whether actuators at `third` stand between one at 0 and others at `other`, which broadcast."""
+    near, far, across = (np.square(away.real) + np.square(away.imag) for away in (third, other - third, other))
+    # Only an actuator nearer to both than they are to each other: the slack separates no nearest neighbours.
+    nearer = np.maximum(near, far) < (1.0 - _ROUNDING) * across
+    return np.asarray(nearer & (near + far <= (1.0 + RIGHT_ANGLE_SLACK) * across))
 
 
 def rings(x: Floats, y: Floats) -> Ints:
-    """Ring of each actuator: number of neighbour steps from the actuator nearest to the centroid (ring 0).
-
-    Actuators that no chain of neighbours reaches get -1.
-    """
+    """Ring of each actuator: number of neighbour steps from the actuator nearest to the centroid (ring 0)."""
     near = np.zeros((x.size, x.size), dtype=bool)
     first, second = neighbour_pairs(x, y).T
     near[first, second] = near[second, first] = True

@@ -89,6 +89,11 @@ class Measurement(Setup):
     temperature: float = float("nan")
 
     @property
+    def has_map(self) -> bool:
+        """Whether there is a map, not only a command that belongs to the history of the actuators."""
+        return bool(np.isfinite(self.coefficients).any() or np.isfinite(self.sag).any())
+
+    @property
     def setup(self) -> Setup:
         """The setup alone."""
         return Setup(**{shared.name: getattr(self, shared.name) for shared in fields(Setup)})

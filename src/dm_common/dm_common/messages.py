@@ -65,10 +65,10 @@ def mirror_from(message: MirrorInfo) -> Mirror:
         ValueError: a field is invalid; the message names it.
     """
     for name in ("actuator_x", "actuator_y"):
-        if len(getattr(message, name)) != message.actuators:
-            raise ValueError(f"mirror_info: {name} has {len(getattr(message, name))} values, not {message.actuators}")
-    if len(message.neighbour_a) != len(message.neighbour_b):
-        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
+        if (size := len(getattr(message, name))) != message.actuators:
+            raise ValueError(f"mirror_info: {name} has {size} values: must have {message.actuators}")
+    if (size := len(message.neighbour_a)) != (other := len(message.neighbour_b)):
+        raise ValueError(f"mirror_info: neighbour_a has {size} values, neighbour_b {other}: must have as many")
     pairs = np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.intp)
     return Mirror(
         name=message.name,
@@ -117,7 +117,8 @@ def measurement_from(response: Any) -> Measurement:
     if zernike.convention not in ("", BORN_WOLF):
         raise ValueError(f"zernike.convention = {zernike.convention!r}: must be {BORN_WOLF}")
     if not len(samples.sag) == len(samples.x) == len(samples.y) == len(samples.weight) > 0:
-        raise ValueError(f"samples: {len(samples.sag)} sag values at {len(samples.x)} points")
+        sizes = ", ".join(f"{len(getattr(samples, name))} {name}" for name in ("sag", "x", "y", "weight"))
+        raise ValueError(f"samples: has {sizes}: must have as many of each, at least one")
     coefficients = np.array(zernike.coefficients, dtype=np.float64)
     sigma = np.array(zernike.sigma, dtype=np.float64)
     return Measurement(
@@ -145,7 +146,7 @@ def driver_refusal(report: ActuatorState | None) -> Refusal | None:
     reason = f": {report.message}" if report.message else ""
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
         return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, f"pdm_driver has lost the link to the electronics{reason}")
-    if report.driver_state == ActuatorState.STATE_SAFING:
+    if report.driver_state == ActuatorState.STATE_SAFING and not report.message.startswith("pdm_driver is not active"):
         return Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
     return Refusal(ErrorCode.DRIVER_INACTIVE, report.message or "pdm_driver is not active: activate it first")
 

@@ -1,5 +1,6 @@
-"""Geometry and limits of a mirror, the reports of its driver, and the check whether a calibration belongs to it."""
+"""Geometry, limits and numbers of the actuators of a mirror, reports of its driver, which calibration belongs to it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -84,6 +85,21 @@ def mismatch(
             f"{mirror.working_radius * 1e3:.3f} mm +-{tolerance:.1%}"
         )
     return ""
+
+
+def actuators_text(numbers: Iterable[object], text: str = "") -> str:
+    """Actuators by their `numbers`, from 1, and the `text` on them; "" = there are none.
+
+    The text begins with its verb in singular and plural: "is/are dead" makes "actuator 5 is dead" and "actuators 5, 7
+    are dead".
+    """
+    listed = [str(number) for number in numbers]
+    if not listed:
+        return ""
+    first, _, rest = text.partition(" ")
+    verbs = first.split("/")
+    noun, verb = ("actuator", verbs[0]) if len(listed) == 1 else ("actuators", verbs[-1])
+    return " ".join(filter(None, (noun, ", ".join(listed), verb, rest)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
 
 #: Prefix of the limitation of a calibration that is used without some actuators; its recipes, of all, are withheld.
-GOES_ON_WITHOUT = "Used without actuator"
+GOES_ON_WITHOUT = "Used without"
 
 
 class RecipeError(ValueError):

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal, beside, size_text
 
 T = TypeVar("T")
 
@@ -83,7 +83,7 @@ class Value:
             between = " to " if isinstance(self.sizes, range) else " or "
             ends = (self.sizes[0], self.sizes[-1]) if isinstance(self.sizes, range) else self.sizes
             sizes = between.join(map(str, ends))
-            raise Refusal(ErrorCode.INVALID_LENGTH, f"{name} has {size} values: must have {sizes}")
+            raise Refusal(ErrorCode.INVALID_LENGTH, f"{size_text(name, size)}: must have {sizes}")
         if self.kind is str:
             for place, item in enumerate(given):
                 self._check_text(f"{name}[{place}]", item)
@@ -101,7 +101,7 @@ class Value:
         not_finite = ~right & ~np.isfinite(given)
         wrong = not_finite if not_finite.any() else ~right
         first, others = int(wrong.argmax()), int(wrong.sum()) - 1
-        subject = subject or f"{name}[{first}] = {given[first]:g}"
+        subject = subject or f"{name}[{first}] = {beside('.6g', given[first], self.low, self.high)}"
         raise Refusal(
             ErrorCode.NOT_FINITE if not_finite.any() else ErrorCode.OUT_OF_RANGE,
             f"{subject}: must be {self.allowed()}" + (f"; {others} more likewise" if others else ""),

@@ -120,3 +120,14 @@ def test_a_process_that_ends_brings_back_its_own_mirror_and_no_other(observer: O
                 command()
         node.destroy_node()
     assert called == ["/left/set_signals", "/left/remapped"]
+
+
+def test_a_driver_that_ends_with_the_process_is_no_failure_to_bring_the_mirror_back(observer: Observer) -> None:
+    """As when Ctrl-C ends all nodes in a calibration: the driver, found still, takes the mirror to its safe shape."""
+    driver = Node("pdm_driver", namespace="/right", context=observer.node.context)
+    driver.create_service(SetSignals, "set_signals", lambda _request, response: response)  # nobody serves it
+    node = Node("calibration", namespace="/right", context=observer.node.context)
+    bench = BenchServices(node, {"settle_time": 0.0, "driver_timeout": 2.0, "degauss_timeout": 5.0})
+    assert "was not brought back to mid range: pdm_driver ends too" in bench.rest_at_exit(np.zeros(37))
+    for each in (node, driver):
+        each.destroy_node()

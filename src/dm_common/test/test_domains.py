@@ -42,3 +42,11 @@ def test_who_holds_a_port_is_named(kind: socket.SocketKind) -> None:
         command = " ".join(sys.orig_argv[:3])[:COMMAND_MAX]
         assert f" by {command} (process {os.getpid()}, ROS domain " in held_by(port)
     assert held_by(port) == ""
+
+
+def test_a_file_closed_meanwhile_hides_no_holder(tmp_path: Path) -> None:
+    """As the list of this process's own files, which takes the lowest number that is free."""
+    closed = (tmp_path / "closed").open("w")
+    with socket.create_server(("127.0.0.1", 0)) as endpoint:
+        closed.close()
+        assert f"(process {os.getpid()}, " in held_by(endpoint.getsockname()[1])

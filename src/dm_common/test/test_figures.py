@@ -1,4 +1,4 @@
-"""Lengths in sentences."""
+"""Lengths and counts in sentences."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dm_common.figures import accuracy_text, distinct_from, in_nanometres, in_wavelengths
+from dm_common.figures import accuracy_text, counted, distinct_from, in_nanometres, in_wavelengths
 from dm_common.optics.conic import range_text
 
 
@@ -83,3 +83,8 @@ def test_a_bound_is_put_twice(repeatable: float, instrument: float, scale: float
     instrument_of = {"instrument_error": instrument, "scale_error": scale}
     calibration = SimpleNamespace(wavelength=632.8e-9, aperture_radius=11e-3, **instrument_of)
     assert accuracy_text(repeatable, calibration, -0.05) == text
+
+
+def test_a_count_agrees_with_its_noun() -> None:
+    assert [counted(count, "map") for count in (0, 1, 2)] == ["no map", "1 map", "2 maps"]
+    assert [counted(count, "map is", "maps are") for count in (0, 1, 2)] == ["no map is", "1 map is", "2 maps are"]

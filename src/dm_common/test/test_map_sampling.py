@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map
+from dm_common.optics.sampling import SamplePoints, edge_clustered_points, on_disc, sample_map
 from dm_common.optics.zernike import basis
 
 
@@ -79,3 +79,14 @@ def test_plane_is_sampled_within_half_a_pixel() -> None:
     points = edge_clustered_points(200)
     expected = 3.0 * (50 + 40 * points.x) - 2.0 * (50 - 40 * points.y)
     np.testing.assert_allclose(sample_map(sag, 50, 50, 40, points), expected, atol=2.5)
+
+
+def test_interpolation_on_the_disc_keeps_a_smooth_shape() -> None:
+    points = edge_clustered_points(500)
+    shape = points.x**2 - 0.5 * points.y
+    shown = on_disc(shape[None], points, 41)[0]
+    axis = np.linspace(-1.0, 1.0, 41)
+    x, y = np.meshgrid(axis, axis)
+    inside = np.hypot(x, y) <= 1.0
+    assert np.isnan(shown[~inside]).all()
+    np.testing.assert_allclose(shown[inside], (x**2 - 0.5 * y)[inside], atol=5e-3)

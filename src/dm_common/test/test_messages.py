@@ -13,6 +13,7 @@ from dm_msgs.srv import Measure
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.messages import (
     applied_from,
+    driver_refusal,
     hysteresis_model_from,
     measurement_from,
     mirror_from,
@@ -65,8 +66,8 @@ def test_a_mirror_is_what_the_driver_describes() -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"actuator_x": [0.0]}, "actuator_x has 1 values, not 7"),
-        ({"neighbour_a": [0]}, "1 neighbour_a, 12 neighbour_b"),
+        ({"actuator_x": [0.0]}, "actuator_x has 1 values: must have 7"),
+        ({"neighbour_a": [0]}, "neighbour_a has 1 values, neighbour_b 12: must have as many"),
         ({"neighbour_a": [0] * 12, "neighbour_b": [7] * 12}, r"indices must lie in 0\.\.6"),
         ({"working_aperture_diameter": 0.0}, "working_radius = 0.0: must be positive"),
         ({"signal_min": 1.0}, "the lower limit must be below the upper"),
@@ -92,7 +93,7 @@ def test_reports_of_the_driver() -> None:
 
 def test_a_map_of_another_convention_or_without_samples_is_refused() -> None:
     answer = Measure.Response()
-    with pytest.raises(ValueError, match="0 sag values at 0 points"):
+    with pytest.raises(ValueError, match="samples: has 0 sag, 0 x, 0 y, 0 weight: must have as many of each"):
         measurement_from(answer)
     answer.zernike.convention = "noll"
     with pytest.raises(ValueError, match=r"zernike\.convention = 'noll'"):
@@ -140,3 +141,17 @@ def test_recipes_that_do_not_fit_together_are_refused() -> None:
         RecipeBook((recipe(-0.01), recipe(0.02, actuators=3)), 100, 0.0)
     with pytest.raises(RecipeError, match="max_zernike = nan m: must be finite and not negative"):
         RecipeBook((replace(recipe(-0.01), max_zernike=np.nan),), 100, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "sentence"),
+    [
+        ("", "pdm_driver is not active"),
+        ("signals: refused", "pdm_driver is not active: signals: refused"),
+        ("pdm_driver is not active: activate it", "pdm_driver is not active: activate it"),
+    ],
+)
+def test_a_driver_on_its_way_to_the_safe_shape_is_called_inactive_once(message: str, sentence: str) -> None:
+    refusal = driver_refusal(ActuatorState(driver_state=ActuatorState.STATE_SAFING, message=message))
+    assert refusal is not None
+    assert str(refusal) == sentence

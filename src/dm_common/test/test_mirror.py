@@ -1,11 +1,13 @@
-"""Whether a calibration belongs to a mirror."""
+"""Whether a calibration belongs to a mirror, and sentences on its actuators."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
 
-from dm_common.mirror import APERTURE_TOLERANCE, Mirror, mismatch
+from dm_common.mirror import APERTURE_TOLERANCE, Mirror, actuators_text, mismatch
 
 MIRROR = Mirror("PDM", "S 7/é", np.array([0.0, 4.3e-3]), np.zeros(2), working_radius=11e-3)
 
@@ -34,3 +36,17 @@ def test_what_is_no_mirror_is_named() -> None:
         Mirror("PDM", "1", 1e3 * MIRROR.x, MIRROR.y, working_radius=11e-3)
     with pytest.raises(ValueError, match="serial = 1234: must be text"):
         Mirror("PDM", 1234, MIRROR.x, MIRROR.y, working_radius=11e-3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text", "sentence"),
+    [
+        ([5], "is/are dead", "actuator 5 is dead"),
+        ([5, 7], "is/are dead", "actuators 5, 7 are dead"),
+        (["7 (fixed at +0.30)"], "", "actuator 7 (fixed at +0.30)"),
+        ((k + 1 for k in (0, 2)), "at a limit", "actuators 1, 3 at a limit"),
+        ([], "is/are dead", ""),
+    ],
+)
+def test_actuators_have_numbers_and_a_verb_that_agrees(numbers: Iterable[object], text: str, sentence: str) -> None:
+    assert actuators_text(numbers, text) == sentence

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,24 +48,28 @@ def running_node(domain: int) -> Iterator[tuple[subprocess.Popen[str], set[Path]
 def test_segments_go_after_their_process_was_killed(domain: int) -> None:
     with running_node(domain) as (process, segments):
         remove_orphaned_segments(0.0)
+        assert all(segment.exists() for segment in segments)
         process.kill()
         process.wait()
-        remove_orphaned_segments()  # may be of a process that has not locked them yet
-        assert all(segment.exists() for segment in segments)
         remove_orphaned_segments(0.0)
         assert not any(segment.exists() or segment.with_name(f"{segment.name}_el").exists() for segment in segments)
 
 
-def test_segments_from_before_the_clock_was_set_back_go_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_memory, "SHARED_MEMORY", tmp_path)
+@pytest.mark.parametrize(
+    ("passed_s", "stays"), [(0.0, True), (1.9, True), (2.1, False), (-1.9, True), (-3600.0, False)]
+)
+def test_segments_go_at_an_age_at_which_a_living_process_has_locked_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed_s: float, stays: bool
+) -> None:
+    """The clock may have been set back since the segment was made."""
     left = [tmp_path / "fastrtps_0123456789abcdef_el", tmp_path / "fastrtps_0123456789abcdef"]
     for file in left:
         file.touch()
-    remove_orphaned_segments()  # may be of a process that has not locked them yet
-    assert all(file.exists() for file in left)
-    os.utime(left[0], (time.time() + 3600.0,) * 2)
+    now = left[0].stat().st_mtime + passed_s
+    monkeypatch.setattr(shared_memory, "SHARED_MEMORY", tmp_path)
+    monkeypatch.setattr(shared_memory.time, "time", lambda: now)
     remove_orphaned_segments()
-    assert not any(file.exists() for file in left)
+    assert [file.exists() for file in left] == [stays, stays]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,13 @@ PLACES = 41
 
 
 def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
-    """Smallest slope of the effective signal over signals of `low` .. `high`, on any move, of each law: (1,) or (N,).
+    """Smallest slope of the effective signal over `low` .. `high`, on any move, of each law, (1,) or (N,)."""
+    return np.asarray(slopes(law, low, high).min(axis=(0, 2, 3)))
+
+
+def slopes(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Floats:
+    """(2, 1 or N, S, R) slopes at S = PLACES signals from `low` to `high`, falling [0] and rising [1], for each
+    number of play operators that have set in; infinite where that cannot be.
 
     After a turning point the operators set in one by one, narrow ones first. One of half-width r can only have set in
     where the range leaves room for a turning point 2 r back.
@@ -30,7 +36,7 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> Flo
     if parts.fading.size:
         slope = slope + _fading_slope(parts.fading, law.actuators or 1, signals, parts.radius)
     dead_zone = 0.0 if parts.radius[0] else np.inf  # slope 0 until a first operator sets in, if any does
-    return np.asarray(np.where(2.0 * parts.radius <= behind, slope, dead_zone).min(axis=(0, 2, 3)))
+    return np.asarray(np.where(2.0 * parts.radius <= behind, slope, dead_zone))
 
 
 def _fading_slope(fading: FadingHysteresis, actuators: int, signals: Floats, radius: Floats) -> Floats:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -34,6 +35,23 @@ CREEP_RATE_MAX = 0.2
 #: Assumed ratio of the errors of requests to those of held-out moves of the calibration. Held-out moves follow each
 #: other within seconds; requests are held for longer, and their errors are 1.2 to 2.6 times as large.
 REQUEST_ERROR_RATIO = 1.4
+
+
+class HeldOut(Protocol):
+    """What tells the 95 % bound on the largest coefficient error of maps that were not used in the fit, m."""
+
+    @property
+    def held_out_max_zernike(self) -> float: ...
+
+
+def request_error(static: HeldOut, moves: HeldOut | None) -> float:
+    """95 % bound on the largest coefficient error of a request, without creep, m.
+
+    Args:
+        static: influence function and figure.
+        moves: law of hysteresis and creep; None = there is none.
+    """
+    return float(static.held_out_max_zernike if moves is None else REQUEST_ERROR_RATIO * moves.held_out_max_zernike)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +137,7 @@ class HysteresisModel:
             raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")
         if len({shape for shape in self._own if shape}) > 1:
             names = "play_weight, duhem_slope, duhem_weight, fading_weight, creep_spectrum, lag_spectrum"
-            raise ValueError(f"{names}: of {self._own} actuators")
+            raise ValueError(f"{names}: have the shapes {self._own}: must be one shape, or () for all actuators")
         for name in (item.name for item in fields(self)):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} holds values that are not finite")

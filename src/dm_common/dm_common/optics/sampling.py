@@ -90,3 +90,19 @@ def _snapped(position: Floats) -> Floats:
     """Positions in pixels; those that coincide with a pixel row or column are put exactly there."""
     nearest = np.rint(position)
     return np.where(np.abs(position - nearest) <= _COINCIDENT, nearest, position)
+
+
+def on_disc(values: Floats, points: SamplePoints, pixels: int) -> Floats:
+    """Interpolate `values` (Q, P) at the points onto square maps (Q, pixels, pixels), NaN outside the unit disc.
+
+    Thin-plate splines through all points; row 0 = bottom.
+    """
+    from scipy.interpolate import RBFInterpolator  # for pictures: no node loads it
+
+    axis = np.linspace(-1.0, 1.0, pixels)
+    x, y = np.meshgrid(axis, axis)
+    inside = np.hypot(x, y) <= 1.0
+    spline = RBFInterpolator(np.column_stack((points.x, points.y)), values.T, kernel="thin_plate_spline")
+    maps = np.full((len(values), pixels, pixels), np.nan)
+    maps[:, inside] = spline(np.column_stack((x[inside], y[inside]))).T
+    return maps

@@ -231,14 +231,16 @@ class BenchServices:
         try:
             client = node.create_client(SetSignals, self._set_signals.service_name)  # of this namespace, as remapped
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
-            if not client.wait_for_service(timeout_sec=timeout):
+            request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder)
+            response: Any = None
+            if client.wait_for_service(timeout_sec=timeout):
+                future = client.call_async(request)
+                rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
+                response = future.result() if future.done() else None
+            if response is None:
                 return "the mirror was not brought back to mid range: pdm_driver ends too or does not answer"
-            future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
-            rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
-            response = future.result() if future.done() else None
-            if response is None or response.error_code != ErrorCode.OK:
-                reason = response.message if response else f"no answer within {timeout:g} s"
-                return f"the mirror could NOT be brought back to mid range: {reason}"
+            if response.error_code != ErrorCode.OK:
+                return f"the mirror could NOT be brought back to mid range: {response.message}"
             return "the mirror is back at mid range"
         finally:
             node.destroy_node()

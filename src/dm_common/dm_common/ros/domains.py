@@ -30,12 +30,20 @@ def holders(targets: Collection[Path]) -> list[str]:
     found = []
     for process in PROCESSES.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # not ours, or gone meanwhile
-            if any(link.readlink() in targets for link in (process / "fd").iterdir()):
+            if any(_leads_to(link) in targets for link in (process / "fd").iterdir()):
                 command = (process / "cmdline").read_text(errors="replace").split("\0")[:3]
                 variables = (process / "environ").read_text(errors="replace").split("\0")
                 domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID") or "0"
                 found.append(f"{' '.join(command).strip()[:COMMAND_MAX]} (process {process.name}, ROS domain {domain})")
     return found
+
+
+def _leads_to(link: Path) -> Path | None:
+    """What an open file is; None = closed meanwhile, as the list of open files itself."""
+    try:
+        return link.readlink()
+    except FileNotFoundError:
+        return None
 
 
 def held_by(port: int) -> str:
