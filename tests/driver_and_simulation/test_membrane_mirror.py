@@ -19,7 +19,7 @@ from dm_bringup.nodes import NODES
 from dm_bringup.suite import load_config
 from dm_calibration import calibrate
 from dm_calibration.acquisition.ingest import IngestSettings
-from dm_calibration.calibration import Calibration
+from dm_calibration.calibration import POKE_CHECK, Calibration
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.hysteresis.excitation import excitation
 from dm_common import Floats
@@ -157,6 +157,11 @@ def test_no_history_is_found(calibration: Calibration) -> None:
     assert known.name in ("linear", "static", "static, each actuator its own")
     assert not known.law.has_history
     assert known.unknown_sigma == 0.0
+
+
+def test_the_poke_check_finds_nothing(calibration: Calibration) -> None:
+    """That a rising signal lowers the surface is right: electrodes pull."""
+    assert not [text for text in calibration.limitations if text.startswith(POKE_CHECK)]
 
 
 def test_spheres_over_the_range_that_is_told(chain: Chain, active: ActiveCalibration) -> None:

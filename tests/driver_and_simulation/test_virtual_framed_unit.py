@@ -98,7 +98,7 @@ def test_an_opening_may_begin_as_frames_do(opening: str) -> None:
     ("changes", "words"),
     [
         ({"header": "A"}, r"framed\.header = 'A'"),
-        ({"channel_order": (0, 1)}, r"framed\.channel_order: must hold each of 0 to 23"),
+        ({"channel_order": (0, 1)}, r"framed\.channel_order = \[0, 1\]: must hold each of 0 to 23"),
         ({"word_bits": 8}, r"framed\.word_bits = 8: must be at least framed\.bits = 14"),
         ({"scale": 0}, r"framed\.scale = 0"),
     ],

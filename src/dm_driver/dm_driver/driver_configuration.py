@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dm_common import Floats
-from dm_common.errors import Refusal
+from dm_common.errors import Refusal, size_text
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.mirror import Mirror
 from dm_common.values import from_values
@@ -106,7 +106,8 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         )
     limiter = SafetyLimiter(limits)
     try:
-        safe_shape = limiter.check_shape(values["safe_signals"] or np.full(actuators, -1.0), "safe_signals")
+        at_zero = min(max(scale.signal_at_zero, limits.low), limits.high)
+        safe_shape = limiter.check_shape(values["safe_signals"] or np.full(actuators, at_zero), "safe_signals")
         steps, longest = values["degauss.steps"], values["degauss.duration_max"]
         degauss_move(limits, 0.0, steps, safe_shape, longest, "degauss.steps")
     except Refusal as refusal:
@@ -144,6 +145,6 @@ def _positions(values: Mapping[str, Any], actuators: int) -> tuple[Floats, Float
     for name, ordinates in (("mirror.actuator_x", x), ("mirror.actuator_y", y)):
         if ordinates.size != actuators:
             raise ValueError(
-                f"{name} has {ordinates.size} values: must have {actuators} (mirror.actuators), or both be empty"
+                f"{size_text(name, ordinates.size)}: must have {actuators} (mirror.actuators), or both be empty"
             )
     return x, y

@@ -81,7 +81,11 @@ PARAMETERS: Final = (
         "Folder for a record of what was last sent to each unit, from which a driver continues in steps after it was "
         "killed; $ROS_HOME replaces ~/.ros if it is set. Empty = keep no record.",
     ),
-    Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
+    Parameter(
+        "safe_signals",
+        reals([], -1.0, 1.0),
+        "The safe shape; empty = all at 0 V, or as near to it as volts.* and limits.signal_* allow.",
+    ),
     Parameter("degauss.steps", whole(100, DEGAUSS_STEPS_MIN, DEGAUSS_STEPS_MAX), "Half-swings of a degauss."),
     live(
         "degauss.duration_max",

@@ -49,7 +49,11 @@ class LastShape:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-            os.posix_fallocate(self._descriptor, 0, 2 * self._slot)  # a disk that fills later takes nothing away
+            try:
+                os.posix_fallocate(self._descriptor, 0, 2 * self._slot)  # a disk that fills later takes nothing away
+            except OSError:
+                self.close()
+                raise
 
     def claim(self) -> None:
         """Keep other drivers with this record away from the unit, until :meth:`close` or the end of the process.

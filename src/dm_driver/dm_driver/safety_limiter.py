@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dm_common import Bools, Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal, beside, size_text
 from dm_common.limits import SLACK, Limits
 from dm_common.values import parameter, real
 
@@ -73,12 +73,12 @@ class SafetyLimiter:
         if shape.shape != (limits.actuators,):
             raise Refusal(
                 ErrorCode.INVALID_LENGTH,
-                f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator",
+                f"{size_text(name, shape.size)}: must have {limits.actuators}, one per actuator",
             )
         low, high = limits.low, limits.high
         outside = (shape < low - SLACK) | (shape > high + SLACK)
         _refuse(ErrorCode.NOT_FINITE, name, shape, ~np.isfinite(shape), "must be a finite number")
-        _refuse(ErrorCode.OUT_OF_RANGE, name, shape, outside, f"must be {low:g} to {high:g}")
+        _refuse(ErrorCode.OUT_OF_RANGE, name, shape, outside, f"must be {low:g} to {high:g}", low, high)
         self._check_neighbours(shape, name, SLACK)
         return np.clip(shape, low, high, out=shape)
 
@@ -161,7 +161,7 @@ class SafetyLimiter:
         raise Refusal(
             ErrorCode.NEIGHBOUR_DIFFERENCE,
             f"{name} of the neighbouring actuators {a + 1} and {b + 1} ({shape[a]:g} and {shape[b]:g}) differ by"
-            f" {difference[worst]:g}: must be at most {limits.neighbour_difference:g} (limits.neighbour_difference)"
+            f" {difference[worst]:.10g}: must be at most {limits.neighbour_difference:g} (limits.neighbour_difference)"
             + (f"; {others} more pairs likewise" if others else ""),
             at_fault,
         )
@@ -187,11 +187,11 @@ class Watchdog:
         return now >= self.deadline
 
 
-def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: Bools, rule: str) -> None:
+def _refuse(code: ErrorCode, name: str, values: Shape, at_fault: Bools, rule: str, *limits: float) -> None:
     """Raise Refusal naming the first of the actuators `at_fault` (N,), if any, and the rule it breaks."""
     if at_fault.any():
         first, others = int(at_fault.argmax()), int(at_fault.sum()) - 1
-        text = f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}"
+        text = f"{name} of actuator {first + 1} = {beside('.6g', values[first], *limits)}: {rule}"
         raise Refusal(code, text + (f"; {others} more likewise" if others else ""), at_fault)
 
 

@@ -74,10 +74,12 @@ def test_a_full_disk_is_found_when_the_record_is_made(tmp_path: Path, monkeypatc
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    opened = len(list(Path("/proc/self/fd").iterdir()))
     with monkeypatch.context() as patch:
         patch.setattr(os, "posix_fallocate", full)
         with pytest.raises(OSError, match="No space left"):
             LastShape(tmp_path / "unit.shape", 37)
+    assert len(list(Path("/proc/self/fd").iterdir())) == opened, "each attempt to configure would keep a file open"
     record = LastShape(tmp_path / "unit.shape", 37)
     monkeypatch.setattr(os, "pwrite", lambda *_: 10)  # bytes: less than was given
     with pytest.raises(OSError, match="No space left"):

@@ -66,7 +66,9 @@ def test_out_of_range_names_actuator_value_and_range() -> None:
 def test_rounding_beyond_the_range_is_cut_off_not_refused() -> None:
     shape = make_limiter().check_shape(np.full(37, 1.0 + 5e-10))
     assert (shape == 1.0).all()
-    assert refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9)).error_code == ErrorCode.OUT_OF_RANGE
+    refusal = refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9))
+    assert refusal.error_code == ErrorCode.OUT_OF_RANGE
+    assert "actuator 1 = 1.000000005: must be -1 to 1" in str(refusal), "a value that is refused is not shown as 1"
 
 
 def test_neighbour_difference_names_the_pair() -> None:
@@ -76,6 +78,8 @@ def test_neighbour_difference_names_the_pair() -> None:
     assert refusal.error_code is ErrorCode.NEIGHBOUR_DIFFERENCE
     assert at_fault(refusal) == [1, 4]
     assert re.search(r"actuators 1 and 4 \(0\.31 and -0\.3\) differ by 0\.61: must be at most 0\.6", str(refusal))
+    signals[3] = -0.29 - 5e-9
+    assert "differ by 0.600000005: must be at most 0.6" in str(refusal_of(make_limiter(difference=0.6), signals))
     signals[3] = -0.29
     make_limiter(difference=0.6).check_shape(signals)
 

@@ -17,7 +17,9 @@ from hypothesis import strategies as st
 
 from dm_common.errors import ErrorCode
 from dm_driver.commands.mirror_hold import MirrorHold
+from dm_driver.driver_configuration import build_configuration
 from dm_driver.driver_messages import state_message
+from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.moves import Kind, WriterState
 from dm_driver.output.volts import LAWS, VoltScale
 from dm_driver.output.wiring import TABLES, OutputStage, wiring_table
@@ -76,6 +78,44 @@ def test_custom_wiring_with_an_unconnected_actuator() -> None:
     message = state_message(lost, None, configuration, "mirror", MirrorHold(lambda: 0.0))
     assert message.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
     assert message.message == "the driver is not active, and the drive electronics are unreachable: no route"
+
+
+def test_channels_without_an_actuator_are_at_zero_volts() -> None:
+    """They were at volts.min: at -200 V, where a bimorph mirror uses -200 to 400 V."""
+    stage = OutputStage(VoltScale(65535, -6, 6, 80, -200, 400), wiring_table("custom", [3, -1, 0], 3, 40), 40)
+    codes = stage.codes(np.array([1.0, 1.0, -1.0]))
+    volts = stage.scale.volts_of_codes(codes)
+    assert volts[[0, 3]] == pytest.approx([-200, 400], abs=0.015)  # a code is 0.0146 V
+    assert np.delete(volts, [0, 3]) == pytest.approx(0, abs=0.01)
+    assert stage.outcome(codes)[1] == pytest.approx([400, 0, -200], abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "law", "limits", "volts"),
+    [
+        (0.0, 300.0, "linear", (-1.0, 1.0), 0.0),
+        (-200.0, 400.0, "linear", (-1.0, 1.0), 0.0),
+        (-400.0, 400.0, "linear", (-1.0, 1.0), 0.0),
+        (-400.0, -50.0, "linear", (-1.0, 1.0), -50.0),
+        (50.0, 400.0, "linear", (-1.0, 1.0), 50.0),
+        (-200.0, 400.0, "linear", (0.0, 1.0), 100.0),  # the nearest signal in limits.signal_min..signal_max
+        (-200.0, 400.0, "linear", (-1.0, -0.5), -50.0),
+        (0.0, 300.0, "square", (-1.0, 1.0), 0.0),
+        (100.0, 300.0, "square", (-1.0, 1.0), 100.0),
+    ],
+)
+def test_the_safe_shape_is_at_zero_volts(
+    low: float, high: float, law: str, limits: tuple[float, float], volts: float
+) -> None:
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    values |= {"mirror.serial": "1", "electronics.kind": "edac40_tcp", "electronics.address": "127.0.0.1"}
+    values |= {"volts.dac_at_zero": -6.0, "volts.dac_at_full": 6.0, "volts.amplifier_gain": 80.0}
+    values |= {"volts.min": low, "volts.max": high, "drive.law": law}
+    values |= {"limits.signal_min": limits[0], "limits.signal_max": limits[1]}
+    configuration = build_configuration(values)
+    assert configuration.output.scale.volts(configuration.safe_shape) == pytest.approx([volts] * 37, abs=1e-9)
+    own = build_configuration(values | {"safe_signals": [limits[1]] * 37})
+    assert own.safe_shape.tolist() == [limits[1]] * 37
 
 
 def test_vendor_rule_when_the_range_is_the_whole_dac() -> None:

@@ -122,6 +122,15 @@ def test_factory_settings_give_minus_six_volts_at_code_zero_and_the_amplifier_sa
     np.testing.assert_allclose(unit.actuator_volts(), -480)
 
 
+def test_a_unit_of_either_sign_is_at_zero_volts_after_power_up() -> None:
+    bimorph = DriveConfig(40, -6.0, 6.0, 80.0, -480.0, 480.0, volts_min=-200.0, volts_max=400.0)
+    unit = DriveUnit(bimorph)
+    np.testing.assert_allclose(unit.actuator_volts(), 0, atol=1e-9)
+    np.testing.assert_allclose(unit.signals(), -1 / 3)
+    unit.take_shares(np.zeros(40))
+    np.testing.assert_allclose(unit.actuator_volts(), -480)
+
+
 def test_true_wiring_and_channels_not_in_the_mask_hold() -> None:
     swapped = (TRIHEX[1], TRIHEX[0], *TRIHEX[2:])
     unit = DriveUnit(DriveConfig(wiring=swapped))
@@ -155,6 +164,10 @@ def test_settings_frames_change_the_outputs_and_are_counted() -> None:
         (DriveConfig(dac_volts_at_full=0.0), "dac_volts_at_full"),
         (DriveConfig(volts_max=0.0), "volts.max"),
         (DriveConfig(volts_min=-300.0, squared=True), "volts.max squared - volts.min squared"),
+        (DriveConfig(volts_min=-200.0), "volts.min = -200 V: must be 0 to 400 V, where electronics"),
+        (DriveConfig(volts_min=-200.0, amplifier_min=-480.0), "volts.min = -200 V: must be 0 to 400 V"),
+        (DriveConfig(dac_volts_at_full=3.0), "volts.max = 300 V: must be 0 to 240 V"),
+        (DriveConfig(volts_max=450.0), "volts.max = 450 V: must be 0 to 400 V"),
         (DriveConfig(amplifier_min=500.0), "amplifier_min = 500 V: must be below electronics.amplifier_max, 400 V"),
     ],
 )
@@ -182,6 +195,12 @@ def test_monitor_counts_what_breaks_a_limit() -> None:
     assert record.largest_jump == pytest.approx(1.2)
     assert record.highest_signal == pytest.approx(1.3)
     assert record.violations == 5
+
+
+def test_monitor_of_a_single_actuator_has_no_neighbours_to_compare() -> None:
+    monitor = Monitor(MonitorConfig(jump=0.1), neighbour_pairs(np.zeros(1), np.zeros(1)), np.zeros(1))
+    assert monitor.watch(np.full(1, 0.1)) == ""
+    assert monitor.record.largest_neighbour_difference == 0.0
 
 
 # The server, over real sockets.

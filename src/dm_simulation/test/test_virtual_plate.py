@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dm_common import geometry
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.plate import Plate, PlateConfig, actuator_positions, neighbour_pairs
 
@@ -171,6 +172,20 @@ def test_actuators_at_the_same_place_are_named() -> None:
     plate = Plate(PlateConfig(actuator_x=(0.0, 5e-3, 0.0, 5e-3), actuator_y=(0.0, 0.0, 5e-3, 0.0)))
     with pytest.raises(ValueError, match="actuators 2 and 4 are at the same place"):
         neighbour_pairs(plate.x, plate.y)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_neighbours_are_those_that_the_driver_limits(seed: int) -> None:
+    """Two programs of one rule: what the monitor counts is what the driver keeps."""
+    random = np.random.default_rng(seed)
+    angle, radius = random.uniform(0, 2 * np.pi, 35), np.repeat([0.0, 1.0, 2.0, 3.0], [1, 6, 12, 16])
+    grid = np.round(np.meshgrid(4.63 * np.arange(6), 4.63 * np.arange(6)), 1).reshape(2, 36)
+    for x, y in (
+        random.standard_normal((2, 1 + 5 * seed)),
+        grid[:, random.permutation(36)[4:]],  # some are missing
+        (radius * np.cos(angle), radius * np.sin(angle)),
+    ):
+        np.testing.assert_array_equal(neighbour_pairs(x, y), geometry.neighbour_pairs(x, y))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import termios
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Self
 
@@ -107,17 +108,13 @@ class DriveElectronics(ABC):
             raise ValueError(f"electronics.{name} is empty: must be {meaning}")
         self._settings = settings
         self._timeout_s = settings.timeout_s
-        self._open = False
+        self.is_open = False
         self._link: Any = None
 
     @property
     @abstractmethod
     def where(self) -> str:
         """Name and address of the unit, for messages."""
-
-    @property
-    def is_open(self) -> bool:
-        return self._open
 
     @property
     def sent_at(self) -> float:
@@ -130,15 +127,15 @@ class DriveElectronics(ABC):
         Raises:
             LinkError: the unit cannot be reached.
         """
-        if self._open:
+        if self.is_open:
             return
         try:
             self._do_open()
         except (OSError, LinkError, *_UNOPENED) as error:
-            self._abandon()
+            self.close()
             reason = re.sub(r".*\[Errno \d+\] ", "", str(error))  # pySerial repeats it, with the port
             raise LinkError(f"cannot open {self.where}: {reason}") from error
-        self._open = True
+        self.is_open = True
 
     def write(self, codes: NDArray[np.uint16], wired: Bools) -> None:
         """Set the outputs, all of them at once.
@@ -169,7 +166,9 @@ class DriveElectronics(ABC):
 
     def close(self) -> None:
         """Close the link; outputs keep their values. Closing a closed link does nothing."""
-        self._abandon()
+        self.is_open = False
+        with suppress(OSError):  # the link is gone anyway
+            self._do_close()
 
     def __enter__(self) -> Self:
         self.open()
@@ -193,7 +192,7 @@ class DriveElectronics(ABC):
             raise CodeError(f"codes[{channel}] = {int(codes[channel])}: must be 0 to {self.max_code}")
 
     def _require_open(self) -> None:
-        if not self._open:
+        if not self.is_open:
             raise NotOpenError(f"{self.where} is not open")
 
     def _guard(self, action: Callable[[], None], what: str) -> None:
@@ -201,7 +200,7 @@ class DriveElectronics(ABC):
         try:
             action()
         except (OSError, LinkError) as error:
-            self._abandon()
+            self.close()
             raise LinkError(f"{what} {self.where}: {error}") from error
 
     def _send(self, data: bytes) -> None:
@@ -215,13 +214,6 @@ class DriveElectronics(ABC):
             if not select.select([], [self._link], [], self._timeout_s)[1]:
                 raise LinkError(f"took no data within {self._timeout_s:g} s")
             data = data[os.write(self._link.fileno(), data) :]
-
-    def _abandon(self) -> None:
-        self._open = False
-        try:
-            self._do_close()
-        except OSError:
-            pass  # the link is gone anyway
 
     @abstractmethod
     def _do_open(self) -> None:

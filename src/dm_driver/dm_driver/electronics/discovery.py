@@ -65,10 +65,6 @@ class Probe:
             if unit is not None:
                 yield unit
 
-    def answered(self, timeout_s: float) -> bool:
-        """Whether an answer is there, or comes within `timeout_s`."""
-        return next(self.answers(timeout_s), None) is not None
-
     def close(self) -> None:
         self._socket.close()
 

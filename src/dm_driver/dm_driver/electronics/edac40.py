@@ -181,7 +181,7 @@ class Edac40Udp(_Edac40):
         if self._settings.discovery_port:
             self._probe = Probe(self._settings.address, self._settings.discovery_port)
             self._probe.query()
-            if not self._probe.answered(self._timeout_s):
+            if next(self._probe.answers(self._timeout_s), None) is None:
                 raise LinkError(
                     f"no answer to discovery on UDP port {self._settings.discovery_port} within {self._timeout_s:g} s"
                 )

@@ -112,6 +112,12 @@ class VoltScale:
         return np.asarray(dac_volts * self.amplifier_gain, dtype=np.float64)
 
     @property
+    def signal_at_zero(self) -> float:
+        """Signal at which an actuator is at 0 V, or as near to it as volts_min..volts_max allows."""
+        low, span = self._powers
+        return min(max(-1.0 - 2.0 * low / span, -1.0), 1.0)
+
+    @property
     def resolution(self) -> float:
         """Normalised signal step of the last code, which is the largest; quantisation moves no signal inside the range
         by more than half of it.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common import Bools, Floats
+from dm_common.mirror import actuators_text
 from dm_driver.output.volts import VoltScale
 from dm_driver.safety_limiter import Shape
 
@@ -66,7 +67,7 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
     twice = {channel: count for channel, count in counts.items() if count > 1}
     if twice:
         text = "; ".join(
-            f"channel {channel} by actuators {', '.join(str(i + 1) for i, c in enumerate(table) if c == channel)}"
+            f"channel {channel} by {actuators_text(i for i, c in enumerate(table, 1) if c == channel)}"
             for channel in twice
         )
         raise ValueError(f"{source}: used more than once: {text}")
@@ -87,8 +88,8 @@ class OutputStage:
         #: (N,) connector channel of each actuator, `NOT_WIRED` for those without one.
         self.channels = channel_of_actuator
         self.wired[channel_of_actuator[self.connected]] = True
-        # Units that always set every channel get the lowest actuator voltage on those without an actuator.
-        self._rest = np.full(channels, scale.codes(np.array([-1.0]))[0], dtype=np.uint16)
+        # Units that always set every channel get 0 V, or what is nearest in the range, on those without an actuator.
+        self._rest = np.full(channels, scale.codes(np.array([scale.signal_at_zero]))[0], dtype=np.uint16)
 
     def codes(self, shape: Shape) -> NDArray[np.uint16]:
         """(channels,) codes for a shape of (N,) signals -1..+1."""
@@ -97,6 +98,6 @@ class OutputStage:
         return codes
 
     def outcome(self, codes: NDArray[np.uint16]) -> tuple[Shape, Floats]:
-        """(N,) signals and (N,) V at the actuators for these codes; an actuator without a channel rests at -1."""
+        """(N,) signals and (N,) V at the actuators for these codes; one without a channel rests at 0 V."""
         of_actuator = np.where(self.connected, codes[self.channels], self._rest[0])
         return self.scale.signals_of_codes(of_actuator), self.scale.volts_of_codes(of_actuator)

@@ -76,6 +76,14 @@ class DriveUnit:
                 f"electronics.amplifier_min = {config.amplifier_min:g} V: must be below electronics.amplifier_max, "
                 f"{config.amplifier_max:g} V"
             )
+        reach = np.sort(self._volts(np.array([0.0, 1.0])))
+        slack = 1e-9 * (reach[1] - reach[0])
+        for name, volts in (("volts.min", config.volts_min), ("volts.max", config.volts_max)):
+            if not reach[0] - slack <= volts <= reach[1] + slack:
+                raise ValueError(
+                    f"{name} = {volts:g} V: must be {reach[0]:g} to {reach[1]:g} V, where electronics.dac_volts_*, "
+                    "electronics.amplifier_gain, _min and _max end, or no frame reaches that signal"
+                )
         self._wiring = wiring
         at_rest = np.clip(-config.dac_volts_at_zero / self._span, 0, 1)
         #: Outputs as fractions of the DAC's range; a unit of few channels still has the registers of an EDAC40.
@@ -106,8 +114,12 @@ class DriveUnit:
 
     def actuator_volts(self) -> Array:
         """Volts at the actuators (N,)."""
+        return self._volts(self.outputs[self._wiring])
+
+    def _volts(self, outputs: Array) -> Array:
+        """Volts behind the amplifier for shares of the DAC's range."""
         config = self.config
-        dac_volts = config.dac_volts_at_zero + self._span * self.outputs[self._wiring]
+        dac_volts = config.dac_volts_at_zero + self._span * outputs
         return np.clip(config.amplifier_gain * dac_volts, config.amplifier_min, config.amplifier_max)
 
     def signals(self) -> Array:

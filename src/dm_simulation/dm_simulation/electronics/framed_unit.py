@@ -82,7 +82,10 @@ class FramedDecoder:
                 raise ValueError(f"framed.{name} = {getattr(config, name)!r}: must be hexadecimal bytes") from None
         self._header, self._terminator, self._opening, self.reply = parts
         if config.channel_order and sorted(config.channel_order) != list(range(config.channels)):
-            raise ValueError(f"framed.channel_order: must hold each of 0 to {config.channels - 1} once, or be empty")
+            raise ValueError(
+                f"framed.channel_order = {list(config.channel_order)}: must hold each of 0 to {config.channels - 1} "
+                "once, or be empty"
+            )
         width = config.word_bits or (config.bits + 7) // 8 * 8
         if width < config.bits:
             raise ValueError(f"framed.word_bits = {width}: must be at least framed.bits = {config.bits}")

@@ -61,7 +61,7 @@ class Monitor:
         jumps = np.abs(signals - self._last)
         differences = np.abs(signals[self._pairs[:, 0]] - signals[self._pairs[:, 1]])
         self._last = signals.copy()
-        jump, difference = float(jumps.max()), float(differences.max())
+        jump, difference = float(jumps.max()), float(differences.max(initial=0.0))
         lowest, highest = float(signals.min()), float(signals.max())
         record.largest_jump = max(record.largest_jump, jump)
         record.largest_neighbour_difference = max(record.largest_neighbour_difference, difference)

@@ -14,6 +14,9 @@ from dm_common.values import parameter, real, reals, switch, whole
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.zernike import Array, Term
 
+#: The squares of the distances to both ends, over that of the ends, up to which an actuator counts as on the circle.
+CIRCLE_SLACK = 1.05
+
 
 @dataclass(frozen=True)
 class PlateConfig:
@@ -72,20 +75,24 @@ def actuator_positions(
 
 
 def neighbour_pairs(x: Array, y: Array) -> NDArray[np.intp]:
-    """Pairs (P, 2) of 0-based actuators closer than 1.2 times the smallest distance.
+    """Pairs (P, 2) of 0-based actuators whose circle, with the line between them as its diameter, holds no other.
+
+    An actuator on the circle, up to rounding, counts as inside, so that a square grid has no diagonals.
 
     Raises:
         ValueError: two actuators are at the same place.
     """
-    distance = np.hypot(x[:, None] - x, y[:, None] - y)
-    first, second = np.triu_indices(len(x), k=1)
-    apart = distance[first, second]
-    nearest = apart.argmin()
-    if not apart[nearest] > 0:
-        pair = f"{first[nearest] + 1} and {second[nearest] + 1}"
-        raise ValueError(f"plate.actuator_x and _y: actuators {pair} are at the same place")
-    near = apart < 1.2 * apart.min()
-    return np.stack([first[near], second[near]], axis=1)
+    apart = np.square(x[:, None] - x) + np.square(y[:, None] - y)
+    pairs = []
+    for first, near in enumerate(apart):
+        far, square = apart[:, first + 1 :], near[first + 1 :]  # of each pair once
+        if (square == 0).any():
+            second = first + 1 + np.argmin(square)
+            raise ValueError(f"plate.actuator_x and _y: actuators {first + 1} and {second + 1} are at the same place")
+        less = square * (1 - 1e-9)  # so that everyone keeps the one nearest to it, and equal distances count as equal
+        inside = (near[:, None] < less) & (far < less) & (near[:, None] + far <= CIRCLE_SLACK * square)
+        pairs += [(first, second) for second in first + 1 + np.flatnonzero(~inside.any(axis=0))]
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def bending_energy_matrix(terms: tuple[Term, ...], poisson_ratio: float) -> Array:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from dm_simulation.mirror.zernike import Array
 
@@ -114,10 +115,7 @@ def _everett(density: Array, step: float) -> tuple[Array, Array]:
     """
 
     def cumulated(values: Array, axis: int) -> Array:
-        values = np.moveaxis(values, axis, -1)
-        steps = step / 2 * (values[..., 1:] + values[..., :-1])
-        summed = np.concatenate([np.zeros_like(values[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
-        return np.moveaxis(summed, -1, axis)
+        return np.asarray(cumulative_trapezoid(values, dx=step, axis=axis, initial=0))
 
     def on_diagonal(values: Array) -> Array:
         return np.diagonal(values, axis1=1, axis2=2)
