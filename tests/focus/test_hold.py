@@ -14,7 +14,7 @@ from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
 from dm_controller.driver_monitor import DriverMonitor
-from dm_controller.focus_types import Moment, Order, SendCommand
+from dm_controller.focus_types import Moment, Order
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
@@ -48,11 +48,11 @@ class Shape:
         active: Any = SimpleNamespace(planner=self.planner)
         self.order = Order(FocusRequest(), Moment(0, 0.0, 0.0), active, move, creep_held=True)
         monitor.order = self.order
-        self.send(self.signals, 0.0, confirmed=True)
+        self.order.send(self.signals, Moment(0, 0.0, 0.0)).confirmed = True
 
     def send(self, signals: np.ndarray, now: float, confirmed: bool) -> None:
         """A correction goes out."""
-        self.order.command = SendCommand(signals, Moment(0, now, now), confirmed=confirmed)
+        self.order.send(signals, Moment(0, now, now), expected_turns=1).confirmed = confirmed
 
     def correct(self, now: float) -> np.ndarray | None:
         """The correction due at `now`, carried out at once."""
@@ -118,10 +118,20 @@ def test_a_command_that_the_driver_never_reports_ends_it() -> None:
     signals = shape.hold.correction(shape.estimate, 100.0)
     assert signals is not None
     shape.send(signals, 100.0, confirmed=False)
-    shape.hold.driver_requested(shape.signals, 100.5)  # on its way
+    another = 0.5 * shape.signals
+    shape.hold.driver_requested(another, 100.5)  # on its way
     assert shape.hold.active
-    shape.hold.driver_requested(shape.signals, 101.5)
+    shape.hold.driver_requested(another, 101.5)
     assert not shape.hold.active
+
+
+def test_a_correction_that_is_lost_does_not_end_it() -> None:
+    shape = Shape()
+    signals = shape.hold.correction(shape.estimate, 100.0)
+    assert signals is not None
+    shape.send(signals, 100.0, confirmed=False)
+    shape.hold.driver_requested(shape.signals, 101.5)
+    assert shape.hold.active
 
 
 def test_a_history_that_gets_lost_ends_it() -> None:

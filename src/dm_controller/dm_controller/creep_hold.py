@@ -76,8 +76,10 @@ class CreepHold:
         order = self._monitor.order
         if order is None or order.command is None or same_signals(requested, order.command.signals):
             return
-        due = order.command.confirmed or now - order.command.sent.steady > CONFIRM_S
-        if due and not order.fall_back(requested):  # else a correction was lost, or one that seemed lost has come
+        command = order.command
+        # `DriverMonitor.unconfirmed` judges the first command, which may be on its way for longer.
+        due = command.confirmed or (command.expected_turns and now - command.sent.steady > CONFIRM_S)
+        if due and not order.follow(requested):  # else a correction was lost, or one that seemed lost has come
             self.end("another command came")
 
     def command(self, estimate: ActuatorEstimate, now: Moment) -> list[SendCommand]:
@@ -88,7 +90,7 @@ class CreepHold:
         if report.holder not in ("", order.request.holder):
             return []  # goes on afterwards if the holder leaves the shape as it is
         signals = self.correction(estimate, now.time)
-        return [] if signals is None else [order.send_on(signals, now, report.turns)]
+        return [] if signals is None else [order.send(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s) for a mirror at rest in the state `estimate`; None = none is due."""

@@ -16,7 +16,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
 from dm_common.messages import driver_refusal, stamp_ns
-from dm_controller.focus_types import Moment, Order, Progress, PublishState
+from dm_controller.focus_types import Effect, Log, Moment, Order, Progress, PublishState
 
 #: States that a driver does not leave by itself, unlike a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
@@ -65,18 +65,15 @@ class DriverMonitor:
     def previous_order(self) -> Order | None:
         """The previous order, while the driver holds its shape and has not taken the last order's first command."""
         previous, report = self.order.previous_order if self.order is not None else None, self.latest
-        if previous is None or previous.command is None or report is None:
-            return None
-        return previous if same_signals(report.requested, previous.command.signals) else None
+        return previous if previous is not None and report is not None and previous.has_sent(report.requested) else None
 
     @property
     def shape(self) -> Order | None:
-        """The last order, if the driver reports its shape, with or without the latest creep correction; else None."""
+        """The last order, if the driver reports its shape, with or without the latest creep corrections; else None."""
         order, report = self.order, self.latest
         if order is None or order.move is None or order.stopped or report is None:
             return None
-        commands = [each for each in (order.command, order.earlier) if each is not None]
-        return order if any(same_signals(report.requested, each.signals) for each in commands) else None
+        return order if order.has_sent(report.requested) else None
 
     def lost(self, reason: str) -> None:
         """Note what happened to a driver that is known to be dead, as a sentence; "" = it may live."""
@@ -93,11 +90,13 @@ class DriverMonitor:
         command = self.order.command if self.order is not None else None
         if command is None or command.confirmed:
             return False
-        command.confirmed = same_signals(report.requested, command.signals)
+        # A driver that is not active may stand in this shape by itself.
+        active = report.driver_state == ActuatorState.STATE_ACTIVE
+        command.confirmed = active and same_signals(report.requested, command.signals)
         written = stamp_ns(report.header.stamp)
         seconds = 1e-9 * (written - command.sent.ns)
         # The command may still be on its way to a driver that was active before it was sent.
-        command.lost |= anew and (report.driver_state != ActuatorState.STATE_ACTIVE or written > command.sent.ns)
+        command.lost |= anew and (not active or written > command.sent.ns)
         if not command.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
@@ -203,13 +202,39 @@ class DriverMonitor:
                 return Progress(share=1.0, remaining=gap, reached=True)
             if not ours and order.starts != self.starts:
                 return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver was restarted meanwhile"))
-            if not ours and (last.confirmed or last.given_up):
+            # A correction follows a command that was confirmed: what was not sent for this shape is another client's.
+            foreign = last.expected_turns and not self.order.has_sent(report.requested)
+            if not ours and (last.confirmed or last.given_up or foreign):
                 return SUPERSEDED
         # Since its last command: a correction for creep may come long after the first.
         if now - last.sent.steady > self._values["move_timeout"]:
             text = report.message if report is not None else ""
             return Progress(failed=Refusal(ErrorCode.TIMEOUT, text or "the driver did not report the shape"))
         return Progress(share=share, remaining=gap)
+
+    def ended_early(self, now: float, failed: Refusal | None = None) -> list[Effect]:
+        """Publish that a shape is not reached, once, if the driver took the command and something ended the move.
+
+        A move that takes longer than `move_timeout` may still end well: only `move_focus` gives up on it.
+
+        Args:
+            failed: what ends it now; None = whatever `progress` finds.
+        """
+        order = self.order
+        if order is None or not order.applied or order.reached or order.stopped:
+            return []
+        if failed is None:
+            progress = self.progress(order, now)
+            order.reached, failed = progress.reached, progress.failed
+        if failed is None or failed.error_code == ErrorCode.TIMEOUT:
+            return []
+        order.applied, order.refusal = False, failed
+        return [Log("warning", f"the shape was not reached: {failed}"), PublishState(order)]
+
+    def cancelled(self, now: float) -> list[Effect]:
+        """Publish that the last order is cancelled, once, unless the mirror has stood in its shape."""
+        on_its_way = self.ended_early(now, Refusal(ErrorCode.CANCELED, "it was cancelled on its way"))
+        return [*self.settled("it was cancelled before the driver confirmed it"), *on_its_way]
 
     def unconfirmed(self, now: float) -> Refusal | None:
         """The reason why the driver has not confirmed the last command in time, once; None = there is none.
@@ -229,13 +254,13 @@ class DriverMonitor:
             return Refusal(refusal.error_code, f"{text}: {refusal}")
         report = self.latest
         assert report is not None  # else there had been a refusal
-        if report.error_code != ErrorCode.OK:
-            return Refusal(report.error_code, f"{text}: {report.message}")
         if self._heard < command.sent.steady:
             return Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
         if command.expected_turns:  # a creep correction, which was lost, or which another client's command overtook
-            self.order.fall_back(report.requested)
+            self.order.follow(report.requested)  # an error may belong to any client's command
             return None
+        if report.error_code != ErrorCode.OK:
+            return Refusal(report.error_code, f"{text}: {report.message}")
         if stamp_ns(report.header.stamp) < command.sent.ns:
             return Refusal(ErrorCode.TIMEOUT, f"{text}: it holds the earlier shape, no command has reached it since")
         return Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another command")

@@ -225,10 +225,14 @@ class MoveFocusAction:
         After a cancel the mirror holds the shape it has, unless it is on its way to one that was asked for since; a
         newer goal continues from there by itself.
         """
-        with self._node.controller() as (controller, _now):
-            waited = order is not None and controller.conditioning.withdraw(order)
-        if not handle.is_cancel_requested:
-            return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+        waited, ended = False, Refusal(ErrorCode.CANCELED, "it was cancelled during the degauss")
+        if not (cancelled := handle.is_cancel_requested):
+            ended = Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
+        with self._node.controller() as (controller, now):
+            if order is not None and (waited := controller.conditioning.withdraw(order)):
+                self._node.carry_out(controller.refuse(order, ended, now), now)
+        if not cancelled:
+            return "abort", ended.error_code, str(ended)
         if order is None:
             return "canceled", ErrorCode.CANCELED, "canceled before anything moved"
         if waited:

@@ -114,7 +114,7 @@ class FocusController:
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
-        effects += self.monitor.settled()
+        effects += [*self.monitor.settled(), *self.monitor.ended_early(now.steady)]
         if gain:
             text = f"the clock jumped {gain:.0f} s ahead: whether the mirror crept for so long is not known"
             effects.append(Log("warning", text))
@@ -208,7 +208,7 @@ class FocusController:
             effects.append(PublishState(order))
         return effects
 
-    def _refuse(self, order: Order, refusal: Refusal, now: Moment) -> list[Effect]:
+    def refuse(self, order: Order, refusal: Refusal, now: Moment) -> list[Effect]:
         """Refuse an order that was not refused when it was judged."""
         self.refused += 1
         order.began, order.move, order.refusal, order.answered = now, None, refusal, True
@@ -217,7 +217,7 @@ class FocusController:
     def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
         """Send the command of `move` and hold its shape; until the driver takes it, the shape before is held."""
         order.command = SendCommand(move.signals, now, 0, order.request.holder, order.request.take_over)
-        order.checked, order.starts = now.time, self.monitor.starts
+        order.sent, order.checked, order.starts = [order.command], now.time, self.monitor.starts
         effects: list[Effect] = [order.command]
         if (before := self.monitor.order) is not None and before.command is not None:
             if not before.answered:
@@ -236,7 +236,7 @@ class FocusController:
         if before is not None:
             before.pending = False
             refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
-            effects += self._refuse(before, refusal, now)
+            effects += self.refuse(before, refusal, now)
         if self.conditioning.run is None:
             number = self.conditioning.begin(move.degauss or 0, self.monitor, now.steady)
             effects.append(StartDegauss(number, move.degauss or 0, order.request.holder, order.request.take_over))
@@ -259,7 +259,7 @@ class FocusController:
         if order is None:
             return []
         if refusal is not None:
-            return self._refuse(order, refusal, now)
+            return self.refuse(order, refusal, now)
         return self._attempt(order, now, degaussed=run.steps if run is not None else 0)
 
     # --- time ---
@@ -277,8 +277,8 @@ class FocusController:
         if order is not None and (unconfirmed := self.monitor.unconfirmed(now.steady)) is not None:
             self.hold.not_confirmed()
             # If the request was answered already, only a correction or the end of a move was not taken.
-            effects += [Log("warning", str(unconfirmed))] if order.answered else self._refuse(order, unconfirmed, now)
-        effects += self._news(now)
+            effects += [Log("warning", str(unconfirmed))] if order.answered else self.refuse(order, unconfirmed, now)
+        effects += [*self.monitor.ended_early(now.steady), *self._news(now)]
         if not self.conditioning.run:  # a correction would end the degauss
             effects += self.hold.command(self.observer.estimate(now.time), now)
         return effects
@@ -293,8 +293,8 @@ class FocusController:
         if last is None or not self.monitor.keeps(order):
             return None
         self.hold.end("the move was cancelled")
+        effects = self.monitor.cancelled(now.steady)
         last.stopped = True
-        effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
         if report is not None and len(report.applied):
             effects.append(last.leave_at(np.array(report.applied), now))
         return effects

@@ -10,6 +10,7 @@ from dm_msgs.msg import ActuatorEstimate, Capabilities, FocusRequest, FocusState
 
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.messages import doubles, estimate_message, time_message
+from dm_common.mirror import actuators_text
 from dm_common.optics.conic import curvatures_text
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import fill_with_nan
@@ -168,9 +169,8 @@ def capabilities_message(
     sentences = [empty or curvatures_text(low, high)]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"{HISTORY_UNKNOWN}{unknown}")
-    dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == "dead"]
-    if dead:
-        sentences.append(f"without actuator{'s' if len(dead) > 1 else ''} {', '.join(dead)}")
+    if dead := actuators_text(k for k, grade in enumerate(active.calibration.actuator_grade, 1) if grade == "dead"):
+        sentences.append(f"without {dead}")
     if stale := active.stale(now.ns, values["calibration_age_max"]):
         sentences.append(stale)
     message.quality = active.calibration.quality

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from dm_msgs.msg import FocusRequest
@@ -13,6 +13,9 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
+
+#: Number of unconfirmed commands for a shape that are known again when the driver reports one.
+UNCONFIRMED = 8
 
 
 class Moment(NamedTuple):
@@ -79,10 +82,10 @@ class Order:
         pending: it waits for a degauss.
         applied: the driver has confirmed the command.
         answered: the outcome of its command has been published.
+        reached: the mirror has stood in its shape.
         gap: largest distance of the applied signals from its shape that was reported, normalised.
-        command: the last command for its shape; None = none was sent.
-        earlier: the last confirmed command before `command`, which the driver follows until `command` arrives; or one
-            after it that seems to be lost, but may still arrive.
+        command: the command for its shape that the driver follows, or is to follow; None = none was sent.
+        sent: the last confirmed one and those after it: on a bad network one that seems lost may still arrive.
         creep_held: its shape is corrected for creep, from its command until the hold ends.
         checked: s, ROS time, of the last check for creep.
         previous_order: its shape is held until the driver takes the first command of this one; None = none.
@@ -99,36 +102,41 @@ class Order:
     pending: bool = False
     applied: bool = False
     answered: bool = False
+    reached: bool = False
     gap: float = 0.0
     command: SendCommand | None = None
-    earlier: SendCommand | None = None
+    sent: list[SendCommand] = field(default_factory=list)
     creep_held: bool = False
     checked: float = 0.0
     previous_order: Order | None = None
     stopped: bool = False
     starts: int = 0
 
-    def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
+    def send(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
         """Another command for its shape, under the same holder."""
-        self.earlier = self.command if self.command is not None and self.command.confirmed else self.earlier
         self.command = SendCommand(signals, now, expected_turns, self.request.holder)
+        confirmed = [each for each in self.sent if each.confirmed][-1:]
+        unconfirmed = self.sent[self.sent.index(confirmed[0]) + 1 :] if confirmed else self.sent
+        self.sent = [*confirmed, *unconfirmed[-UNCONFIRMED:], self.command]
         return self.command
 
-    def fall_back(self, requested: Sequence[float] | Floats) -> bool:
-        """Take the other of the last two commands as the present one, if the driver follows it; return whether."""
-        last, other = self.command, self.earlier
-        if last is None or other is None or (last.confirmed and other.confirmed):
-            return False
-        if not same_signals(requested, other.signals):
-            return False
-        other.confirmed = True
-        self.command, self.earlier = other, last
-        return True
+    def has_sent(self, requested: Sequence[float] | Floats) -> bool:
+        """Whether a command in `sent` asked for these signals (N,)."""
+        return any(same_signals(requested, each.signals) for each in self.sent)
+
+    def follow(self, requested: Sequence[float] | Floats) -> bool:
+        """Take another command in `sent` as the present one, if the driver follows it; return whether."""
+        for other in reversed(self.sent):
+            past = other is self.command or (other.confirmed and self.command is not None and self.command.confirmed)
+            if not past and same_signals(requested, other.signals):
+                other.confirmed, self.command = True, other
+                return True
+        return False
 
     def leave_at(self, signals: Floats, now: Moment) -> SendCommand:
         """A command to stay at the present signals (N,), which after quantisation may break a limit by a step."""
         assert self.active is not None  # else nothing was commanded
-        return self.send_on(self.active.mirror.limits.scaled(signals)[0], now)
+        return self.send(self.active.mirror.limits.scaled(signals)[0], now)
 
 
 class Progress(NamedTuple):

@@ -11,7 +11,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles, time_message
 from dm_controller.driver_monitor import CONFIRM_S, DriverMonitor
-from dm_controller.focus_types import Moment, Order, SendCommand
+from dm_controller.focus_types import Moment, Order
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget
 
@@ -33,7 +33,8 @@ def command(driver: DriverMonitor, signals: np.ndarray) -> None:
     """A command goes out, one second after the epoch."""
     none: Any = None  # no prediction
     move, now = Move(FocusTarget(0.01), signals, signals, 0.0, True, 0.0, none), Moment(10**9, 1.0, BEGAN)
-    driver.order = Order(FocusRequest(curvature=0.01), now, move=move, command=SendCommand(signals, now))
+    driver.order = Order(FocusRequest(curvature=0.01), now, move=move)
+    driver.order.send(signals, now)
 
 
 def monitor(timeout: float = TIMEOUT) -> DriverMonitor:

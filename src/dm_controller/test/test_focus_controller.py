@@ -142,7 +142,7 @@ class Bench:
         self.turns = self.degausses = self.sequence = 0
         self.turned_at = np.zeros(0)
         self.history_known, self.obeys = False, True
-        self.state = ActuatorState.STATE_ACTIVE
+        self.state, self.error_code = ActuatorState.STATE_ACTIVE, ErrorCode.OK
         self.holder = ""
         self.unused = np.zeros(ACTUATORS, dtype=bool)  # without a channel: they rest at -1
         self.commands: list[SendCommand] = []
@@ -193,6 +193,7 @@ class Bench:
             degausses=self.degausses,
             history_known=self.history_known,
             moving=moving,
+            error_code=self.error_code,
             message=message,
             holder=self.holder,
             holding=f"{self.holder} holds it",
@@ -222,6 +223,13 @@ class Bench:
                 next_report += 0.5
                 self.report()
             self.do(self.controller.tick(self.now))
+
+    def send_correction(self) -> SendCommand:
+        """Hold a shape just set until a correction is sent, which the driver does not take, nor anything after it."""
+        self.wait(0.3)
+        self.obeys, sent = False, len(self.commands)
+        self.wait(0.2)
+        return self.commands[sent]
 
     def refusal(self) -> Refusal:
         refusal = self.outcomes[-1].refusal
@@ -340,6 +348,11 @@ def test_where_nothing_is_reachable_capabilities_say_so(bench: Bench) -> None:
     assert "no curvature is reachable: the initial figure" in str(bench.refusal())
     bench.ask(0.01, zernike=[0.0] * 12 + [1e-3] + [0.0] * 8)
     assert str(bench.refusal()).endswith("no curvature is reachable with these added Zernike terms")
+
+
+def test_a_curvature_that_is_hardly_beyond_the_range_is_told_from_its_end() -> None:
+    denied = FocusTarget(0.05604).denied(20.04e-9, 20e-9, (-0.0561, 0.0560349))
+    assert denied.startswith("curvature = +0.05604 1/m: ") and "error of 20.04 nm (allowed 20.0 nm)" in denied
 
 
 def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
@@ -722,6 +735,35 @@ def test_a_withdrawn_order_leaves_the_mirror_degaussed(bench: Bench) -> None:
     assert bench.commands == [] and bench.controller.conditioning.run is None
 
 
+@pytest.mark.parametrize(("cancelled", "code"), [(True, ErrorCode.CANCELED), (False, ErrorCode.PREEMPTED)])
+def test_a_goal_that_ends_during_its_degauss_is_told_of(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, cancelled: bool, code: int
+) -> None:
+    server = SimpleNamespace(preempted=lambda _handle: bool(bench.degauss_runs) and not cancelled)
+    monkeypatch.setattr(focus_actions, "WorkerActionServer", lambda *_arguments, **_fields: server)
+    bench.history_known = False
+    bench.report()
+    handle: Any = SimpleNamespace(
+        request=MoveFocus.Goal(request=FocusRequest(curvature=0.02, time_budget=60.0)), is_cancel_requested=False
+    )
+
+    def feedback(_feedback: MoveFocus.Feedback) -> None:
+        handle.is_cancel_requested = cancelled and bool(bench.degauss_runs)
+
+    handle.publish_feedback = feedback
+    node: Any = SimpleNamespace(
+        await_start=lambda: None,
+        order=lambda request: bench.ask(request.curvature, time_budget=request.time_budget),
+        answer=lambda order: state_message(order, VALUES, None),
+        carry_out=lambda effects, _now: bench.do(effects),
+        controller=lambda: nullcontext((bench.controller, bench.now)),
+    )
+    result = focus_actions.MoveFocusAction(node, VALUES)._run(handle)[1]
+    assert result.error_code == result.state.error_code == code
+    assert [(outcome.pending, outcome.refusal is None) for outcome in bench.outcomes] == [(True, True), (False, False)]
+    assert bench.refusal().error_code == code
+
+
 def test_at_rest_the_mirror_stays_and_requests_are_refused_until_the_calibration_is_used_again(bench: Bench) -> None:
     bench.ask(0.01)
     bench.history_known = False
@@ -992,6 +1034,118 @@ def test_a_correction_that_arrives_late_is_known_again(bench: Bench) -> None:
     assert bench.error(move_of(order).effective) < 1e-4
 
 
+def test_a_correction_that_arrives_after_a_later_one_was_sent_is_known_again(bench: Bench) -> None:
+    order = bench.ask(0.02)
+    bench.wait(2.0)
+    bench.obeys, sent = False, len(bench.commands)
+    while len(bench.commands) < sent + 2:
+        bench.wait(0.1)
+        bench.report()
+    bench.obeys = True
+    bench.move(bench.commands[sent].signals)  # the driver then drops the second one, which does not count any more
+    bench.wait(3.0)
+    assert bench.controller.hold.active and bench.controller.monitor.progress(order, bench.time).reached
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_a_shape_is_held_where_its_command_was_long_on_its_way(bench: Bench, corrected: bool) -> None:
+    if corrected:  # and a correction of the shape before it is lost
+        bench.ask(0.01)
+        bench.wait(0.3)
+    bench.obeys, sent = False, len(bench.commands)
+    bench.wait(0.2)
+    assert (len(bench.commands) > sent) == corrected
+    order = bench.ask(0.02)
+    bench.wait(1.5)
+    bench.report()  # the driver still holds the shape before
+    bench.obeys = True
+    bench.move(move_of(order).signals)
+    bench.wait(5.0)
+    assert order.applied and bench.controller.hold.active
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
+def test_a_shape_is_held_where_its_command_was_long_on_its_way_and_an_earlier_correction_came_first() -> None:
+    bench = Bench(driver_timeout=3.0)
+    bench.degauss()
+    bench.ask(0.02)
+    correction = bench.send_correction()
+    order = bench.ask(0.01)
+    bench.wait(0.1)
+    bench.report()  # the driver still holds the shape before the correction
+    bench.move(correction.signals)
+    bench.wait(1.5)
+    bench.report()
+    bench.move(move_of(order).signals)
+    bench.obeys = True
+    bench.wait(5.0)
+    assert order.applied and bench.controller.hold.active
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("state", "code"),
+    [
+        (ActuatorState.STATE_LINK_LOST, ErrorCode.ELECTRONICS_UNREACHABLE),
+        (ActuatorState.STATE_INACTIVE, ErrorCode.DRIVER_INACTIVE),
+        (ActuatorState.STATE_ACTIVE, ErrorCode.PREEMPTED),
+    ],
+)
+def test_a_move_that_ends_on_its_way_is_told_of_once(bench: Bench, state: int, code: int) -> None:
+    bench.obeys = False
+    order = bench.ask(0.02)
+    start, bench.requested = bench.signals, move_of(order).signals
+    bench.report(moving=True)
+    assert [outcome.applied for outcome in bench.outcomes] == [True]
+    bench.signals = bench.requested = 0.5 * (start + move_of(order).signals)  # the driver stays where it is
+    bench.state = state
+    bench.report()
+    bench.state = ActuatorState.STATE_ACTIVE
+    bench.report()
+    bench.wait(2.0)
+    assert [outcome.applied for outcome in bench.outcomes] == [True, False] and bench.refusal().error_code == code
+    assert bench.outcomes[-1].request is order.request
+
+
+def test_a_move_that_is_cancelled_on_its_way_is_told_of_once(bench: Bench) -> None:
+    bench.obeys = False
+    order = bench.ask(0.02)
+    bench.requested = move_of(order).signals
+    bench.report(moving=True)
+    bench.do(bench.controller.stop(order, bench.now) or [])
+    bench.move(bench.commands[-1].signals)
+    bench.wait(2.0)
+    assert [outcome.applied for outcome in bench.outcomes] == [True, False]
+    assert bench.refusal().error_code == ErrorCode.CANCELED and bench.outcomes[-1].request is order.request
+
+
+def test_a_request_for_the_shape_that_stands_is_told_of_once_where_the_link_is_lost(bench: Bench) -> None:
+    bench.obeys = False
+    order = bench.ask(0.0)
+    assert (move_of(order).signals == bench.requested).all()
+    bench.state = ActuatorState.STATE_LINK_LOST  # the driver refuses the command, and stands where it is
+    bench.report()
+    bench.wait(4.0)
+    assert len(bench.outcomes) == 1 and bench.refusal().error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+
+
+def test_a_driver_that_dies_on_the_way_is_told_of_with_the_request(bench: Bench) -> None:
+    bench.obeys = False
+    order = bench.ask(0.02)
+    bench.requested = move_of(order).signals
+    bench.report(moving=True)
+    bench.do(bench.controller.tick(bench.now, "pdm_driver is not heard any more"))
+    assert bench.refusal().error_code == ErrorCode.DRIVER_UNAVAILABLE and bench.outcomes[-1].request is order.request
+
+
+def test_a_shape_that_stood_is_left_without_a_word(bench: Bench) -> None:
+    bench.ask(0.02)
+    bench.move(np.full(ACTUATORS, 0.1))  # somebody else
+    bench.wait(2.0)
+    assert [outcome.applied for outcome in bench.outcomes] == [True]
+
+
 def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) -> None:
     bench.history_known = False
     bench.report()
@@ -1016,15 +1170,24 @@ def test_a_request_that_fails_leaves_the_shape_that_stands_held(bench: Bench) ->
 
 def test_a_request_that_fails_while_a_correction_is_on_its_way_leaves_the_shape_held(bench: Bench) -> None:
     order = bench.ask(0.02)
-    bench.wait(0.3)
-    bench.obeys, sent = False, len(bench.commands)
-    bench.wait(0.2)
-    correction = bench.commands[sent]
+    correction = bench.send_correction()
     bench.ask(0.01)
     bench.obeys = True
     bench.move(correction.signals)  # the driver takes the correction, and not the request
     bench.wait(6.0)
     assert bench.refusal().error_code == ErrorCode.PREEMPTED
+    assert bench.controller.monitor.order is order and bench.controller.hold.active
+    assert bench.error(move_of(order).effective) < 1e-4
+
+
+def test_a_request_that_the_driver_refuses_while_a_correction_is_lost_leaves_the_shape_held(bench: Bench) -> None:
+    order = bench.ask(0.02)
+    bench.send_correction()
+    bench.ask(0.01)  # takes the place of the correction, and is refused
+    bench.error_code = ErrorCode.STALE
+    bench.obeys = True
+    bench.wait(6.0)
+    assert bench.outcomes[-1].request.curvature == 0.01 and bench.refusal().error_code == ErrorCode.STALE
     assert bench.controller.monitor.order is order and bench.controller.hold.active
     assert bench.error(move_of(order).effective) < 1e-4
 
@@ -1056,6 +1219,17 @@ def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:
     assert (bench.signals == shape).all() and not bench.controller.hold.active
     bench.wait(5.0)
     assert not any("not confirmed" in line for line in bench.log), "it is no trouble"
+
+
+def test_the_command_of_another_is_noticed_while_a_correction_is_on_its_way(bench: Bench) -> None:
+    """Else a cancel of the move would undo it."""
+    order = bench.ask(0.02)
+    bench.send_correction()
+    bench.report()
+    assert bench.controller.monitor.progress(order, bench.time).failed is None
+    bench.move(np.full(ACTUATORS, 0.1))  # the driver then drops the correction
+    failed = bench.controller.monitor.progress(order, bench.time).failed
+    assert failed is not None and failed.error_code == ErrorCode.PREEMPTED
 
 
 def test_a_new_calibration_while_a_shape_is_held(bench: Bench) -> None:
@@ -1112,7 +1286,7 @@ def test_health_says_what_stands_while_a_correction_is_on_its_way(bench: Bench) 
     order = bench.controller.monitor.order
     assert order is not None and order.command is not None and order.command.confirmed
     for _ in range(2):  # the driver has reported neither yet
-        order.send_on(order.command.signals + 1e-4, bench.now)
+        order.send(order.command.signals + 1e-4, bench.now)
         assert health(bench.controller, VALUES, bench.now).values["curvature"] == 0.02
     bench.move(np.full(ACTUATORS, 0.1))  # somebody else
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values

@@ -253,8 +253,10 @@ class FocusRig(DriverRig):
         """
 
         def settled() -> bool:
-            refused = any(answer.error_code != ErrorCode.OK for answer in self.states_of(state.curvature))
-            return refused or self.near(state.signals) or (loop and overtaken(list(self.states), state))
+            told = self.states_of(state.curvature)
+            refused = any(answer.error_code != ErrorCode.OK for answer in told)
+            newest = told[-1] if told else state  # after a degauss, a request is planned anew, from what is known then
+            return refused or self.near(newest.signals) or (loop and overtaken(list(self.states), state))
 
         if state.error_code != ErrorCode.OK:
             if not state.message:
@@ -265,7 +267,9 @@ class FocusRig(DriverRig):
             self.wait(settled, "the request to be carried out or told of", patience_s)
         except RigError:
             record.lost += 1
-            record.remarks.append(f"accepted, {state.curvature:+.5f} 1/m: neither carried out nor told of")
+            off = np.abs([self.signals, self.states[-1].requested] - np.asarray(state.signals)).max(axis=1).round(3)
+            remark = f"accepted, {state.curvature:+.5f} 1/m: neither carried out nor told of; off by {off}"
+            record.remarks.append(f"{remark}, driver: {self.states[-1].message}")
 
     def refocus(self, random: Random) -> float:
         """Ask for a shape until it stands; the seconds that took.

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_common import Floats
-from dm_common.errors import Cancelled
+from dm_common.errors import Cancelled, beside
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Bench
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
@@ -206,11 +206,11 @@ class RecipeBuilder:
         self.state = law.move(self.state, applied, self._now())
         missed = law.effective(law.advance(self.state, self._now() + settle_time)) - aim
         worst, denied = int(np.abs(missed).argmax()), response(self._loop.mirror.model, missed).max_zernike
-        if denied > self._options.reachable:
+        if denied > (allowed := self._options.reachable):
             raise UnreachableError(
                 f"curvature = {target.curvature:+.4f} 1/m: actuator {worst + 1} stands at its limit and misses its "
                 f"effective signal by {abs(missed[worst]):.4f}, which leaves a coefficient error of "
-                f"{denied * 1e9:.1f} nm (allowed {self._options.reachable * 1e9:g} nm): no recipe reaches this shape"
+                f"{beside('.1f', denied * 1e9, allowed * 1e9)} nm (allowed {allowed * 1e9:g} nm): no recipe reaches it"
             )
         if not plant.settle():
             raise Cancelled("cancelled while settling")

@@ -19,7 +19,7 @@ from dm_msgs.msg import FocusRequest
 from dm_common import SIGMAS_95, Floats
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
-from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel, HysteresisState
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState, request_error
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
@@ -139,7 +139,7 @@ class Planner:
             TargetError: no such surface exists over the aperture.
         """
         mirror, law = self.mirror, self.law
-        cut, own, error = False, None, None
+        cut, own, error, measured = False, None, None, None
         if recipe is None:
             found = self._closed_form.find(target)
             aim, largest = found or mirror.command(target)
@@ -150,7 +150,7 @@ class Planner:
             # model's own signals, plus what they deny of the recipe's signals.
             aim, (own, largest) = recipe.effective, mirror.command(target)
             if math.isfinite(recipe.error):
-                error, largest = recipe.error, min(largest, recipe.error)
+                error, measured, largest = recipe.error, recipe.built, min(largest, recipe.error)
         if state is None:
             middle, known, travel = mirror.limits.middle, False, 0.0
             state = rested(law, np.full(len(aim), middle), time, middle)
@@ -176,9 +176,7 @@ class Planner:
             creep = None
             if law.creep_rate:
                 at = law.advance(begun, arrival)
-                position = law.position_at(at, signals)
-                measured = recipe.built if recipe is not None and error is not None else None
-                creep = self._creep_error.bound(at, position, ahead, measured)
+                creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, measured)
             return self._bounded(plan, signals, known, creep, error)
 
         def drift() -> tuple[float, float]:
@@ -255,8 +253,7 @@ class Planner:
             error: the bound for this shape with a known history, m; None = that for any shape.
         """
         if error is None:
-            found, model = self.hysteresis, self.mirror.model
-            error = model.held_out_max_zernike if found is None else REQUEST_ERROR_RATIO * found.held_out_max_zernike
+            error = request_error(self.mirror.model, self.hysteresis)
         return math.hypot(error, 0.0 if known else self._unknown_history[0])
 
     def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound | None, error: float | None) -> Plan:

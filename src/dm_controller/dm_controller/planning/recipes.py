@@ -16,7 +16,7 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from dm_common import Floats
-from dm_common.errors import CodedError, ErrorCode, Refusal
+from dm_common.errors import CodedError, ErrorCode, Refusal, size_text
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.recipes import Recipe, RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
@@ -236,7 +236,7 @@ def recipe_targets(
     sizes = sorted({0, len(TERMS), len(TERMS) * len(curvatures)})
     if len(zernike) not in sizes:
         allowed = " or ".join(map(str, sizes))
-        raise Refusal(ErrorCode.INVALID_LENGTH, f"zernike has {len(zernike)} values: must have {allowed}")
+        raise Refusal(ErrorCode.INVALID_LENGTH, f"{size_text('zernike', len(zernike))}: must have {allowed}")
     terms = np.reshape(zernike if len(zernike) else np.zeros(len(TERMS)), (-1, len(TERMS)))
     each = np.broadcast_to(terms, (len(curvatures), len(TERMS))).tolist()
     targets = [

@@ -9,7 +9,7 @@ import numpy as np
 from dm_msgs.msg import FocusRequest
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal, beside
 from dm_common.optics.conic import conic_coefficients, conic_sag, curvatures_text
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_common.values import Fields, real, reals, text
@@ -132,8 +132,9 @@ class FocusTarget:
         else:
             text = f"reachable: {curvatures_text(low, high)}"
         return (
-            f"curvature = {self.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
-            f"{error * 1e9:.1f} nm (allowed {allowed * 1e9:.1f} nm); {text}"
+            f"curvature = {beside('+.4f', self.curvature, low, high)} 1/m: the limits of the actuators leave a "
+            f"coefficient error of {beside('.1f', error * 1e9, allowed * 1e9)} nm (allowed {allowed * 1e9:.1f} nm); "
+            f"{text}"
         )
 
     def with_curvature(self, curvature: float) -> FocusTarget:
