@@ -193,6 +193,7 @@ def test_wrong_wiring_is_put_right_before_the_mirror_is_used() -> None:
     assert after_run(found, None) == "start the nodes with these parameters, and calibrate again"
     assert after_run(Calibrate.Result(id="c1"), None) == "./dm focus 0.02"
     assert "load_calibration with calibration: c1" in after_run(Calibrate.Result(id="c1"), None, used=False)
+    assert after_run(Calibrate.Result(id="c1"), None, used=False).startswith("./dm console ")  # without knowing ROS
     assert after_run(Calibrate.Result(poke_check_passed=True), None) == "./dm calibrate"
 
 

@@ -203,6 +203,17 @@ def test_a_run_that_goes_on_is_not_deleted_for_being_the_oldest(
     assert opened(tmp_path, POKES).resumed.endswith("with 3 maps")
 
 
+def test_a_run_of_one_map_is_told_in_the_singular(tmp_path: Path) -> None:
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, lagging_bench(), cut_before(1)).run()
+    run.journal.close()
+    again = opened(tmp_path, POKES)
+    again.journal.close()
+    assert again.resumed.endswith("with 1 map")
+    assert any("(1 map) is set aside: a fresh run" in note for note in opened(tmp_path, POKES, fresh=True).notes)
+
+
 def test_why_a_run_does_not_go_on_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = opened(tmp_path, POKES)
     with pytest.raises(PowerCut):

@@ -255,6 +255,19 @@ def test_each_half_of_the_checks_of_a_short_run_is_predicted_with_the_other_in_t
     np.testing.assert_array_equal(with_others.fit.residual, without.fit.residual)
 
 
+@pytest.mark.parametrize(("others", "alone"), [(18, False), (24, True)])
+def test_from_three_other_maps_per_actuator_on_no_check_helps_to_predict_another(
+    others: int, alone: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are of one kind: predicted with others in the fit they promised half of what requests erred by."""
+    run, check = simulated_run("prandtl_ishlinskii", 60)
+    run.responses.usable[np.flatnonzero(~check)[others:]] = False
+    found = identify(run, check, [LINEAR])
+    monkeypatch.setattr("dm_calibration.hysteresis.identify.FEW", 0)
+    without = identify(run, check, [LINEAR])
+    assert np.array_equal(found.held_out[check], without.held_out[check]) == alone
+
+
 def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two laws at once a law without plays fades otherwise: own laws that began there erred three times as much."""
 

@@ -37,14 +37,14 @@ COMMON = tuple(law for law in LAWS if not law.own)
 class Relays:
     """Actuators of relays that switch up at centre + half-width and down at centre - half-width."""
 
-    def __init__(self, actuators: int, spread: float, rng: np.random.Generator) -> None:
+    def __init__(self, actuators: int, spread: float, rng: np.random.Generator, loops: float = 0.12) -> None:
         decay = 0.25 * np.exp(spread * rng.standard_normal((actuators, 1)))
         skew = spread * rng.standard_normal((actuators, 1))
         self._half_width = decay * rng.exponential(1.0, (actuators, RELAYS))
         centre = rng.uniform(-1.0, 1.0, (actuators, RELAYS))
         self._centre = centre + skew * (1.0 - centre**2)  # a density that leans to one side
         self._up = self._centre < 0.0
-        self._share = 0.12 * np.exp(spread * rng.standard_normal(actuators))
+        self._share = loops * np.exp(spread * rng.standard_normal(actuators))
 
     def move(self, signals: Floats) -> Floats:
         """Go to `signals` (N,); returns displacements (N,), normalised."""
@@ -56,11 +56,13 @@ class Relays:
 
 
 @cache
-def relay_run(spread: float, seed: int, maps: int = 200, creep: float = 0.01) -> tuple[Run, NDArray[np.bool_]]:
+def relay_run(
+    spread: float, seed: int, maps: int = 200, creep: float = 0.01, loops: float = 0.12
+) -> tuple[Run, NDArray[np.bool_]]:
     """A run of the excitation on seven such actuators that creep, seen through a random matrix, and its check maps."""
     mirror = make_mirror(rings=1)
     rng = np.random.default_rng(seed)
-    actuators = Relays(mirror.actuators, spread, rng)
+    actuators = Relays(mirror.actuators, spread, rng, loops)
     commands = excitation(mirror, maps)
     time = np.cumsum(1.0 + commands.dwell)
     mixing = HALF_STROKE * rng.standard_normal((mirror.actuators, 12)) / 4.0
@@ -196,6 +198,20 @@ def test_a_law_too_flat_to_be_inverted_loses_some_of_its_hysteresis_and_others_n
     assert slope_min(OwnLaws(run, preisach, start, scatter, 0.98).fit(keep).law, *run.reach).min() < 0.98
 
 
+def test_several_laws_too_flat_to_be_inverted_are_fitted_again_so_that_they_rise() -> None:
+    """They lost a share of their hysteresis: 24 nm in moves held out, now 6; with 16 of 35 on a bimorph 63, now 12."""
+    run, check = relay_run(0.6, 16, 90, loops=0.35)
+    preisach = next(law for law in CANDIDATES if law.name == "Preisach, each actuator its own")
+    start = identify(run, check, COMMON, slope_min=-np.inf).fit.law
+    as_found, risen = (OwnLaws(run, preisach, start, np.full(12, NOISE), least).fit(~check) for least in (-np.inf, 0.1))
+    flat = slope_min(as_found.law, *run.reach) < 0.1
+    assert flat.sum() == 2
+    np.testing.assert_array_equal(risen.changed, flat)
+    assert slope_min(risen.law, *run.reach).min() >= 0.1
+    for rows in (check, ~check):
+        assert np.linalg.norm(risen.residual[rows]) < 1.1 * np.linalg.norm(as_found.residual[rows])
+
+
 def test_a_law_far_too_flat_is_drawn_towards_the_others_which_keep_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
     """For one of 37 that fell to -2.7 where no map came all lost theirs: 30 nm in moves held out, now 11."""
     run, _check = relay_run(0.2, 14, 120)
@@ -210,7 +226,7 @@ def test_a_law_far_too_flat_is_drawn_towards_the_others_which_keep_theirs(monkey
         return np.where(np.arange(7) == flattest, -2.7 if far[-1] > 0.3 * far[0] else 1.0, 1.0)
 
     as_found = OwnLaws(run, preisach, start, scatter, -np.inf).fit(keep)
-    monkeypatch.setattr("dm_calibration.hysteresis.own_laws.slope_min", slopes)
+    monkeypatch.setattr("dm_calibration.hysteresis.steepness.slope_min", slopes)
     held = OwnLaws(run, preisach, start, scatter, 0.1).fit(keep)
     assert 0.0 < far[-1] < 0.3 * far[0]
     assert held.changed.tolist() == [number == flattest for number in range(7)]
@@ -237,7 +253,7 @@ def test_a_law_whose_own_operator_cannot_be_inverted_takes_the_common_one_and_ot
         return np.where(two & own, -30.0, 1.0)
 
     monkeypatch.setattr("dm_calibration.hysteresis.own_laws.own_slopes", lambda slope, weight, changes: slope + apart)
-    monkeypatch.setattr("dm_calibration.hysteresis.own_laws.slope_min", slopes)
+    monkeypatch.setattr("dm_calibration.hysteresis.steepness.slope_min", slopes)
     monkeypatch.setattr(law_shape, "slope_min", slopes)
     duhem = tuple(law for law in CANDIDATES if law.name.startswith("Preisach and Duhem"))
     found, common = identify(run, check, (COMMON[0], *duhem)), identify(run, check, (COMMON[0], duhem[0]))

@@ -16,7 +16,8 @@ from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteres
 from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import in_nanometres
-from dm_common.hysteresis.model import REQUEST_ERROR_RATIO
+from dm_common.hysteresis.model import request_error
+from dm_common.mirror import actuators_text
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
@@ -88,7 +89,7 @@ class Calibration:
     def __repr__(self) -> str:
         """What it is of and how good, not the arrays."""
         law = f"law of the actuators: {self.hysteresis.name}, " if self.hysteresis else ""
-        return f"<Calibration {self.id}: {len(self.maps)} maps, {law}promise {in_nanometres(self.promise)}>"
+        return f"<Calibration {self.id}: {self.maps.has_map.sum()} maps, {law}promise {in_nanometres(self.promise)}>"
 
     @property
     def stamp_ns(self) -> int:
@@ -98,9 +99,7 @@ class Calibration:
     @property
     def promise(self) -> float:
         """95 % bound on the largest coefficient error of a request, m, from maps that were not used in the fit."""
-        found = self.hysteresis
-        error = self.fit.held_out_max_zernike if found is None else REQUEST_ERROR_RATIO * found.held_out_max_zernike
-        return float(error)
+        return request_error(self.fit, self.hysteresis)
 
     def doubts(self, error_max: float = CALIBRATED_ERROR_MAX) -> list[str]:
         """Reasons why the calibration counts as approximate only; empty = the mirror is calibrated.
@@ -108,11 +107,8 @@ class Calibration:
         Args:
             error_max: largest promise that counts as calibrated, m.
         """
-        reasons = []
-        for grade in NO_RESPONSE:
-            numbers = np.flatnonzero(self.fit.grades == grade) + 1
-            if numbers.size:
-                reasons.append(f"actuators {', '.join(map(str, numbers))} are {GRADE_NAMES[grade]}")
+        silent = ((np.flatnonzero(self.fit.grades == grade) + 1, GRADE_NAMES[grade]) for grade in NO_RESPONSE)
+        reasons = [actuators_text(numbers, f"is/are {name}") for numbers, name in silent if numbers.size]
         if not self.promise <= error_max:  # NaN too
             reasons.append(f"the promise is above {in_nanometres(error_max)} (calibrated_error_max)")
         return reasons
@@ -120,7 +116,7 @@ class Calibration:
     @property
     def maps_dropped(self) -> int:
         """Number of maps that were excluded from the fit, plus states of which no map could be taken."""
-        return int((~self.fit.used).sum()) + len(self.dropped)
+        return len(self.maps.rejected(self.fit.reasons)) + len(self.dropped)
 
 
 #: Fields of a calibration that are stored as attributes of its file, with their types.

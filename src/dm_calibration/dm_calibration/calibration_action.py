@@ -23,6 +23,7 @@ from dm_calibration.procedure.recorded_run import plan_text
 from dm_calibration.procedure.resumable_run import OpenRun, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
+from dm_common.figures import counted
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, duration_clock, wait_for_clock
 from dm_common.values import fill_with_nan
@@ -117,7 +118,7 @@ class CalibrateAction:
         result, run = self._result, self._opened(runs)
         enough = GoodEnough(
             self._goal.until,
-            lambda reached: self._report_reached(reached, len(run.outcome.records)),
+            lambda reached: self._report_reached(reached, run.outcome.measured),
             self._mirror.limits,
         )
         procedure = self._procedure(run, enough)
@@ -128,7 +129,7 @@ class CalibrateAction:
             self._conclude(run, runs, enough)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
-            result.maps = result.maps or len(run.outcome.records)
+            result.maps = result.maps or run.outcome.measured
             result.dropped = result.dropped or list(run.outcome.dropped)
         finally:
             run.journal.close()
@@ -136,8 +137,8 @@ class CalibrateAction:
         kept = ""
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (
-                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal resumes from there, "
-                "`dm calibrate --fresh` begins anew"
+                f"{counted(run.outcome.measured, 'map is', 'maps are')} kept in {run.journal.folder}: the same goal "
+                "resumes from there, `dm calibrate --fresh` begins anew"
             )
         result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
 
@@ -237,8 +238,7 @@ class CalibrateAction:
             raise Refusal(
                 error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"
             ) from error
-        rejected = zip(outcome.maps().label, fit.reasons, strict=True)
-        result.dropped = [*outcome.dropped, *(f"{label}: {reason}" for label, reason in rejected if reason)]
+        result.dropped = [*outcome.dropped, *map(": ".join, outcome.maps().rejected(fit.reasons))]
         result.maps = int(fit.used.sum())
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number

@@ -9,13 +9,13 @@ from dm_msgs.msg import ActuatorHysteresis, Capabilities, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
 from std_msgs.msg import Header
 
-from dm_calibration.calibration import Calibration
+from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.updates import InUse
 from dm_common import Floats
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.model import HysteresisModel, request_error
 from dm_common.messages import doubles, taken, time_message
 
 # Fields that have the same name in the message and in a calibration or its fit.
@@ -70,6 +70,7 @@ def put_updates(
     temperature: float,
     doubts: list[str],
     mirror_changed: bool,
+    error_max: float = CALIBRATED_ERROR_MAX,
     age_s: float = 0.0,
 ) -> None:
     """Put the updates by later maps into the `message` of their calibration.
@@ -78,6 +79,7 @@ def put_updates(
         temperature: degC; NaN = not known.
         doubts: sentences that are added to the known limitations.
         mirror_changed: whether maps show a change of the mirror: the calibration then does not count as CALIBRATED.
+        error_max: m, largest bound of a request, widened as it is now, with which it does.
         age_s: s since a map last agreed, or since the calibration; bounds count the drift to be expected in that time.
     """
     fit, drift = kept.filter.changed(kept.drift, temperature), kept.drift
@@ -96,7 +98,8 @@ def put_updates(
     message.creep_shown = drift.trust
     message.known_limitations = [*message.known_limitations, *doubts]
     message.actuator_grade = _grades(fit)
-    if mirror_changed or drift.given_up:
+    promise = request_error(message, None if kept.calibration.hysteresis is None else message.hysteresis)
+    if mirror_changed or drift.given_up or not promise <= error_max:
         message.quality = Capabilities.APPROXIMATE
 
 

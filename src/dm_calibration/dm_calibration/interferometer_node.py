@@ -31,6 +31,7 @@ from dm_calibration.map_files import MapFileError, SurfaceMap
 from dm_calibration.map_files.datx_structure import as_text
 from dm_calibration.optics.orientation import Orientation
 from dm_common.errors import CodedError, ErrorCode, Refusal
+from dm_common.figures import counted
 from dm_common.measurement import Measurement
 from dm_common.messages import stamp_ns, time_message
 from dm_common.ros import parameters, qos
@@ -267,7 +268,7 @@ class InterferometerNode(ManagedNode):
 
 def _mended(surface: SurfaceMap) -> str:
     count = surface.phase_steps
-    return f", {count} region{'s' if count > 1 else ''} brought back by whole fringes" if count else ""
+    return f", {counted(count, 'region')} brought back by whole fringes" if count else ""
 
 
 def main() -> int:

@@ -23,6 +23,7 @@ from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.hysteresis_fit import NO_DEGAUSS, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.influence.screening import unusable
 from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -134,6 +135,8 @@ def test_a_file_without_data_in_a_folder_wants_the_times(tmp_path: Path) -> None
     outcome = outcome_of(tmp_path, commands, times, mirror, hysteresis=True)
     assert "none of the" in outcome.dropped[0] and outcome.dropped[0].startswith("map 3: ")
     assert [record.stamp_ns / 1e9 for record in outcome.records][-4:] == list(times)
+    maps = outcome.maps()
+    assert maps.rejected(unusable(maps, 0.5)) == [], "it is among the dropped ones already"
 
 
 @pytest.mark.slow

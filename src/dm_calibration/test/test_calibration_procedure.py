@@ -312,6 +312,24 @@ def test_a_move_without_a_map_may_have_left_hysteresis(mirror: Mirror) -> None:
     assert len(run(bench, mirror, plan_options=PlanOptions(reference_every=1)).outcome.dropped) == 1
 
 
+def test_a_command_without_a_map_is_kept_and_counts_as_none(bench: LinearBench, mirror: Mirror) -> None:
+    bench.failing = {"excitation 30": 9}
+    outcome = run(bench, mirror, PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=60)).outcome
+    assert outcome.maps().label.count("excitation 30") == 1 and len(outcome.dropped) == 1
+    assert outcome.measured == len(outcome.records) - 1
+
+
+def test_a_bump_puts_the_maps_since_in_doubt_not_the_commands_without_one(bench: LinearBench, mirror: Mirror) -> None:
+    plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=150))
+    before, bumped = [index for index, step in enumerate(plan.steps) if step.kind is StepKind.REFERENCE][-2:]
+    bench.failing = {"excitation 30": 9}
+    bench.changes = {plan.steps[bumped].label: {"coefficients": np.full(21, 1e-6)}}
+    outcome, since = Outcome(), bumped - before - 2
+    with pytest.raises(Refusal, match=f"bumped, and {since} maps since are in doubt"):
+        Procedure(plan, mirror, bench, outcome=outcome).run()
+    assert sum("in doubt, bumped before" in entry for entry in outcome.dropped) == since
+
+
 @pytest.mark.parametrize("back_s", [3, 60])
 def test_a_clock_set_back_spoils_no_run(back_s: int, bench: LinearBench, mirror: Mirror) -> None:
     """Maps wait for it to catch up, else the run ends and is resumed later."""

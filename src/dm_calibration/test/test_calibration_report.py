@@ -37,7 +37,7 @@ from dm_calibration.report.checks import valid_until
 from dm_calibration.report.content_fit import residuals
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
-from dm_calibration.report.figures import on_disc, response_figure
+from dm_calibration.report.figures import response_figure
 from dm_calibration.report.html_page import html_page
 from dm_calibration.report.page import figures_of, sections, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
@@ -46,7 +46,6 @@ from dm_common import Floats
 from dm_common.hysteresis.model import REQUEST_ERROR_RATIO, HysteresisModel
 from dm_common.optics.conic import conic_coefficients, range_text
 from dm_common.optics.piston_tilt import rms
-from dm_common.optics.sampling import edge_clustered_points
 from dm_common.recipes import Recipe, RecipeBook
 from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import make_mirror
@@ -206,7 +205,7 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     absolute = html_page("", [certificate(known, {})])
     assert "flat.dat, SHA-256 01" in absolute and " nm, limited by" in absolute.partition("absolute to ")[2][:20]
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
-    assert "actuators 1 are dead" in replace(calibration, fit=dead).doubts()[0]
+    assert "actuator 1 is dead" in replace(calibration, fit=dead).doubts()[0]
     assert people(tmp_path / "none.json") == {}
 
 
@@ -325,6 +324,43 @@ def test_every_map_has_a_row(page: str, calibration: Calibration) -> None:
         assert f"<td>{label}</td>" in rows
 
 
+def test_a_command_without_a_map_has_no_number_and_is_dropped_once(calibration: Calibration) -> None:
+    """A hysteresis run keeps it: it belongs to the history of the actuators."""
+    lost, maps = np.arange(len(calibration.maps)) == 5, calibration.maps
+    without = replace(
+        maps,
+        coefficients=np.where(lost[:, None], np.nan, maps.coefficients),
+        sag=np.where(lost[:, None], np.nan, maps.sag),
+        residual_rms=np.where(lost, np.nan, maps.residual_rms),
+        valid_fraction=np.where(lost, 0.0, maps.valid_fraction),
+    )
+    said = "a Zernike coefficient is not finite"
+    reasons = tuple(said if one else reason for one, reason in zip(lost, calibration.fit.reasons, strict=True))
+    fit = replace(calibration.fit, used=calibration.fit.used & ~lost, reasons=reasons)
+    dropped = (*calibration.dropped, f"{maps.label[5]}: no map within 5 s")
+    whole = replace(calibration, maps=without, fit=fit, dropped=dropped)
+    (table,) = content.every_map(whole).tables
+    assert tuple(table.rows[5])[3:] == ("dropped", "no map", "0.0")
+    assert whole.maps_dropped == calibration.maps_dropped + 1, "it is counted once"
+    (left_out,) = content.cautions(whole).tables
+    assert [row for row in left_out.rows if row[0] == maps.label[5]] == [(maps.label[5], "no map within 5 s")]
+    measured, provenance = len(maps) - 1, content.provenance(whole).tables[0]
+    counts = {name: value for name, value in provenance.rows if name.startswith("maps")}
+    assert counts["maps in the fit"] == f"{int(fit.used.sum())} of {measured}"
+    assert sum(int(part.split()[0]) for part in counts["maps"].split(", ")) == measured
+    assert f": {measured} maps, " in repr(whole)
+
+
+def test_counts_read_as_a_sentence(calibration: Calibration) -> None:
+    clean = replace(
+        calibration,
+        dropped=(),
+        limitations=(),
+        fit=replace(calibration.fit, used=np.ones(len(calibration.maps), dtype=bool)),
+    )
+    assert content.summary(clean).paragraphs[-1] == "No map was dropped; no warning or limitation below."
+
+
 def test_residuals_are_those_of_the_fit(calibration: Calibration) -> None:
     left = residuals(calibration)
     expected = calibration.fit.map_residual[calibration.fit.used]
@@ -383,17 +419,6 @@ def test_creep_grows_by_its_rate_in_a_decade() -> None:
     # The sum over elements two to a decade follows the straight line within its ripple.
     growth = np.diff(step_response(PLAY, np.array([1.0, 10.0, 100.0, 1000.0])))
     np.testing.assert_allclose(growth, PLAY.creep_rate, rtol=0.1)
-
-
-def test_interpolation_on_the_disc_keeps_a_smooth_shape() -> None:
-    points = edge_clustered_points(500)
-    shape = points.x**2 - 0.5 * points.y
-    shown = on_disc(shape[None], points, 41)[0]
-    axis = np.linspace(-1.0, 1.0, 41)
-    x, y = np.meshgrid(axis, axis)
-    inside = np.hypot(x, y) <= 1.0
-    assert np.isnan(shown[~inside]).all()
-    np.testing.assert_allclose(shown[inside], (x**2 - 0.5 * y)[inside], atol=5e-3)
 
 
 def test_a_length_is_put_by_the_wavelength_where_that_says_more() -> None:

@@ -78,8 +78,8 @@ def test_an_aperture_that_the_sensor_does_not_see_is_refused(radius: float) -> N
         ),
         ({"convention": "fringe", "coefficients": [0.0] * 26}, "must have at least 27 terms"),
         ({"convention": "zernike"}, "convention = 'zernike': must be one of born_wolf, noll, ansi, fringe"),
-        ({"coefficients": [np.nan] * 21}, "must be finite"),
-        ({"radius": np.inf}, "must be finite"),
+        ({"coefficients": [np.nan] * 21}, "coefficients = nan: must be finite"),
+        ({"radius": np.inf}, "radius = inf: must be finite"),
         ({"coefficients": [0.3] * 21}, "coefficients up to 0.3 m: must be 0.001 m or less; in m?"),
     ],
 )

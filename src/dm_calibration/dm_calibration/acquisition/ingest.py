@@ -14,6 +14,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
 from dm_calibration.optics.phase_steps import mend_phase_steps
 from dm_common import Bools
+from dm_common.errors import beside
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
@@ -162,8 +163,8 @@ class Ingest:
             )
         if source.pitch and settings.pitch and abs(source.pitch - settings.pitch) > ZOOM_SHARE * settings.pitch:
             raise MapRejectedError(
-                f"pitch of the file = {source.pitch * 1e6:.3f} um, parameter pitch = {settings.pitch * 1e6:.3f} um: "
-                "another zoom?"
+                f"pitch of the file = {source.pitch * 1e6:.3f} um: must be {settings.pitch * 1e6:.3f} um within "
+                f"{ZOOM_SHARE:.0%} (parameter pitch): another zoom?"
             )
         pitch = settings.pitch or source.pitch
         sag, subtracted = source.sag, source.system_error_subtracted
@@ -182,11 +183,10 @@ class Ingest:
         if self._fitter is None or not self._fitter.fits(surface.valid, aperture):
             self._fitter = None  # free it first: two workspaces would double the memory
             self._fitter = MapFitter(surface.valid, *circle)
-        if self._fitter.valid_fraction < settings.valid_fraction_min:
+        if self._fitter.valid_fraction < (least := settings.valid_fraction_min):
             raise InsufficientDataError(
-                f"valid fraction = {self._fitter.valid_fraction:.3f} of the aperture (radius {aperture.radius_px:.1f} "
-                f"pixels): must be at least {settings.valid_fraction_min:g} "
-                "(parameter aperture.valid_fraction_min)"
+                f"valid fraction = {beside('.3f', self._fitter.valid_fraction, least)} of the aperture (radius "
+                f"{aperture.radius_px:.1f} pixels): must be at least {least:g} (parameter aperture.valid_fraction_min)"
             )
         fit = self._fitter.fit(sag)
         samples = sample_map(sag, *circle, self.points)

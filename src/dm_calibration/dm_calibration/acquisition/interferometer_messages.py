@@ -71,8 +71,9 @@ def sensor_map(message: ZernikeCoefficients, source: str) -> Seen:
         coefficients = to_born_wolf(message.coefficients, convention)
     except ValueError as error:
         raise MapRejectedError(f"{source}: {error}") from error
-    if not np.isfinite([*coefficients, radius, wavelength]).all():
-        raise MapRejectedError(f"{source}: coefficients, radius and wavelength: must be finite")
+    for name, value in (("coefficients", coefficients), ("radius", radius), ("wavelength", wavelength)):
+        for wrong in np.extract(~np.isfinite(value), value):
+            raise MapRejectedError(f"{source}: {name} = {wrong:g}: must be finite")
     if (largest := float(np.abs(coefficients).max())) > HEIGHT_MAX:
         raise MapRejectedError(f"{source}: coefficients up to {largest:g} m: must be {HEIGHT_MAX:g} m or less; in m?")
     pitch = 2.0 * radius / PIXELS if radius > 0.0 else None

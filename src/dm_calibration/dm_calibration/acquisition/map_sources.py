@@ -175,7 +175,7 @@ def _measured(maps: Maps, settings: IngestSettings, gaps: bool) -> tuple[list[Me
             dropped[number] = str(error).removeprefix(f"map {number + 1}: ")
     last = next((one for one in found if one is not None), None)
     if last is None:
-        raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps: there is none")
+        raise InsufficientDataError(dropped[0]) if dropped else ValueError("maps is empty: must hold at least one")
     stamps = {number: one.stamp_ns for number, one in enumerate(found) if one is not None and one.stamp_ns} or {0: 0}
     # The time of a file without data is interpolated between the maps around it; 0 = no map on one side.
     interpolated = np.interp(range(len(found)), [*stamps], [*stamps.values()], left=0, right=0)

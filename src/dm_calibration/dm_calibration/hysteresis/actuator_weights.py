@@ -5,6 +5,7 @@ standard deviations is estimated from the maps.
 """
 
 from inspect import signature
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -26,13 +27,27 @@ SPREAD = 0.1
 SPREAD_ACTUATORS = 20
 
 
+class Known(NamedTuple):
+    """What is known of each actuator's weights besides maps and prior: normal equations, (N, F, F) and (N, F)."""
+
+    precision: Floats
+    pull: Floats
+
+
 def alike(actuators: int, spread: float) -> tuple[float, float]:
     """`between` of :func:`weights_of` for a standard deviation `spread` between actuators, see SPREADS."""
     own = spread**-2.0
     return own, own / (actuators + spread**2)
 
 
-def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[float, float], begin: Floats) -> Floats:
+def weights_of(
+    features: Floats,
+    left: Floats,
+    gains: Floats,
+    between: tuple[float, float],
+    begin: Floats,
+    known: Known | None = None,
+) -> Floats:
     """Least-squares weights w (F, N) of the features x (M, F, N): sum_fn w_fn x_mfn gains_nd = left_md.
 
     The inverse of the prior covariance over actuators is own I - common 1 1'; different features are independent.
@@ -41,17 +56,21 @@ def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[flo
     Args:
         between: own and common of the prior above.
         begin: (F, N) weights to begin with.
+        known: what is known besides; None = nothing.
     """
     own, common = between
     count, actuators = features.shape[1:]
     columns, rows = (np.ascontiguousarray(features.transpose(axes)) for axes in ((2, 0, 1), (2, 1, 0)))
     seen = gains @ gains.T
-    alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
+    beforehand = own * np.eye(count) + (known.precision if known else 0.0)
+    alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + beforehand)
     together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
 
     def normal(flat: Floats) -> Floats:
         unknown = flat.reshape(actuators, count, 1)
         shown = (rows @ (seen @ (columns @ unknown)[..., 0])[..., None])[..., 0]
+        if known:
+            shown = shown + (known.precision @ unknown)[..., 0]
         return np.asarray(shown + own * unknown[..., 0] - common * unknown[..., 0].sum(axis=0)).ravel()
 
     def nearly_solved(flat: Floats) -> Floats:
@@ -59,6 +78,8 @@ def weights_of(features: Floats, left: Floats, gains: Floats, between: tuple[flo
         return np.asarray(solved + alone @ (together @ solved.sum(axis=0))).ravel()
 
     right = (rows @ (gains @ left.T)[..., None]).ravel()
+    if known:
+        right = right + known.pull.ravel()
     shape = (right.size, right.size)
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
     tolerance = {_RELATIVE: SOLVED, "atol": 0.0}

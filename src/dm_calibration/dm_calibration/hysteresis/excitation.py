@@ -89,11 +89,9 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
         ValueError: too many maps.
     """
     fewest = fewest_maps(mirror.actuators)
-    if maps < fewest:
-        allowed = f"must be {fewest} to {MAPS_MAX} for {mirror.actuators} actuators"
-        raise TooFewMapsError(f"hysteresis_maps = {maps}: {allowed}")
-    if maps > MAPS_MAX:
-        raise ValueError(f"hysteresis_maps = {maps}: must be at most {MAPS_MAX}")
+    if not fewest <= maps <= MAPS_MAX:
+        text = f"hysteresis_maps = {maps}: must be {fewest} to {MAPS_MAX} for {mirror.actuators} actuators"
+        raise TooFewMapsError(text) if maps < fewest else ValueError(text)
     return _part(mirror, maps, seed, FLAT_KNOWN * mirror.actuators, wide=maps >= WIDE_LEVELS_FROM)
 
 

@@ -1,6 +1,7 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator, FadingHysteresis
@@ -46,6 +47,13 @@ def play_features(signals: Floats, radius: Floats, powers: int, rest: float = 0.
     values = play_values(signals, radius, rest)
     stacked = np.stack([values**power - rest**power for power in range(1, powers + 1)], axis=2)
     return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
+
+
+def play_weights(series: Floats) -> Floats:
+    """(N, R, D) weights of powers 1 .. D, from those of Legendre polynomials (N, R, D); constants are left out."""
+    orders = series.shape[-1]
+    powers = [np.pad(legendre.leg2poly([0.0] * order + [1.0]), (0, orders - order)) for order in range(1, orders + 1)]
+    return np.asarray(series @ np.array(powers)[:, 1:])
 
 
 def pattern_basis(radius: Floats, orders: int) -> Floats:

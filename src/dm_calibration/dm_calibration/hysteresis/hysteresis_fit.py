@@ -96,6 +96,9 @@ def fit_hysteresis(
     law = _followed(maps, found.fit.law, run)[1]
     if law.creep_rate:
         law = replace(law, creep_covariance=creep_covariance(run, law))
+    remarks = [*_remarks(found), *_left_out(maps, run), *_drifted(law)]
+    if not maps.degaussed.any():
+        remarks.append(NO_DEGAUSS)
     return HysteresisFit(
         name=found.fit.candidate.name,
         law=law,
@@ -103,7 +106,7 @@ def fit_hysteresis(
         held_out_max_zernike=_largest_of(covariance) * _few_maps(found, run) * _held(found, maps),
         unknown_sigma=unknown_history_sigma(found.fit.law, *run.reach),
         maps=int(run.responses.usable.sum()),
-        remarks=(*_remarks(found), *_left_out(maps, run), *_drifted(law), *(NO_DEGAUSS,) * (not maps.degaussed.any())),
+        remarks=tuple(remarks),
     )
 
 
@@ -149,7 +152,7 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
         return ()
     more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
     return (
-        f"Hysteresis: {len(labels)} of {len(maps)} maps left out, since they lack data or contradict the model: "
+        f"Hysteresis: {len(labels)} of {len(maps)} commands left out, whose map is missing or contradicts the model: "
         f"{', '.join(labels[:5])}{more}.",
     )
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.linalg import block_diag
 
-from dm_calibration.hysteresis.actuator_weights import SPREAD, alike, likeliest_spread, weights_of
+from dm_calibration.hysteresis.actuator_weights import SPREAD, Known, alike, likeliest_spread, weights_of
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit
 from dm_calibration.hysteresis.features import (
     DUHEM_ROUNDS,
@@ -30,16 +30,18 @@ from dm_calibration.hysteresis.features import (
     padded_slope,
     pattern_basis,
     play_values,
+    play_weights,
     smoothness,
     spectrum_prior,
     weight_of,
 )
 from dm_calibration.hysteresis.responses import agreeing
 from dm_calibration.hysteresis.run import Run, basis_of, without
+from dm_calibration.hysteresis.steepness import Steepness, shrink
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common import Bools, Floats
 from dm_common.hysteresis.duhem import NO_DRIVE, NONE, FadingHysteresis
-from dm_common.hysteresis.law_shape import normalised, slope_min
+from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_RATE_MAX, CREEP_TIMES, HysteresisModel
 
 #: Prior standard deviations: of the weight of a Duhem operator; of that weight times the change of a slope coefficient.
@@ -68,11 +70,10 @@ ROUNDS, ROUNDS_MAPS = 20, 300
 OUTLIER_OF_FIT = 6.0
 #: Fewest maps per actuator from which the spread between actuators is estimated: a close fit to fewer overestimates it.
 SPREAD_MAPS = 5
-#: A law whose slope is too small to be inverted safely loses a share of its hysteresis, in up to SHRINKS steps. If it
-#: has its own Duhem operator and would keep less than SHRUNK, it takes the common operator first. If it would keep less
-#: than LEAST, hardly any map may show where it is too flat: it is drawn halfway to the mean of the others instead, with
-#: half its Duhem weight. If more than one law and more than the share LOST are so flat, all stay: the fit is refused.
-SHRINKS, SHRUNK, LEAST, LOST = 8, 0.9, 0.7, 0.1
+#: If several laws are too flat to be inverted safely, all are fitted again so that they rise, unless residuals become
+#: RISEN times as large. One still too flat, or a single one, loses a share of its hysteresis, in up to SHRINKS steps;
+#: if it has its own Duhem operator and would keep less than SHRUNK, it takes the common operator first.
+RISEN, SHRINKS, SHRUNK = 2.0, 8, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +111,11 @@ class OwnLaws:
     def __init__(
         self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, slope_min: float
     ) -> None:
-        self.run, self.candidate, self._scatter, self._slope_min = run, candidate, scatter, slope_min
+        self.run, self.candidate, self._scatter = run, candidate, scatter
         self._slope = common.duhem_slope
         radius, orders = candidate.radius, candidate.powers
         self._basis = pattern_basis(radius, orders)
+        self._steepness = Steepness(self._basis, radius, *run.in_use, slope_min)
         signals = run.signals - run.rest
         values = run.along(lambda signals: play_values(signals, radius, run.rest))
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.full(1, run.rest), orders)[0, 1:]
@@ -128,8 +130,7 @@ class OwnLaws:
         self._patterned, self._linear = slice(1, first), slice(first, self._plain.shape[1])
         self.spread: float | None = None
         self._rounds_needed = max(ROUNDS, ROUNDS * ROUNDS_MAPS // max(len(signals), 1))
-        self._creeps = common.creep_rate > 0.0
-        self._creep = weight_of(common.creep_rate)
+        self._creeps, self._creep = common.creep_rate > 0.0, weight_of(common.creep_rate)
         elements = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
         lag = LAG**2 * smoothness(LAGS, SPECTRUM_CORRELATION)
         prior = block_diag(elements, lag, CREEP_SLOPE**2)
@@ -154,38 +155,31 @@ class OwnLaws:
                 own = self._linear.stop
                 for _ in range(DUHEM_ROUNDS):
                     changing = np.concatenate((self._features(slope), self._changes(slope)), axis=1)
-                    patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
+                    patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter, None)
                     slope = own_slopes(slope, patterns[own], patterns[own + 1 :])
                     patterns = patterns[: own + 1]
         common = slope if isinstance(start, OwnFit) else padded_slope(self._slope, actuators)
         while True:
             features = self._features(slope)
-            patterns, creep, scatter, residual = self._rounds(features, keep, patterns, creep, scatter)
-            law = self._law(patterns, creep, slope)
-            worse = self._share_kept(law) < SHRUNK
-            if slope.ndim < 3 or not (worse := worse & (slope != common).any(axis=(1, 2))).any():
+            patterns, creep, scatter, residual = self._rounds(features, keep, patterns, creep, scatter, None)
+            law, share = self._law(patterns, creep, slope)
+            if slope.ndim < 3 or not (worse := (share < SHRUNK) & (slope != common).any(axis=(1, 2))).any():
                 break
             slope, changed = np.where(worse[:, None, None], common, slope), changed | worse
             patterns[-1, worse] = 0.0
+        if (flat := share < 1.0).sum() > 1:
+            risen = self._rounds(features, keep, patterns, creep, scatter, slope)
+            if np.linalg.norm(risen[-1][keep]) < RISEN * np.linalg.norm(residual[keep]):
+                (patterns, creep, scatter, residual), changed = risen, changed | flat
+                law, share = self._law(patterns, creep, slope)
         for _ in range(SHRINKS):
-            share = self._share_kept(law)
-            flat, lost = share < 1.0, share < LEAST
-            if not flat.any() or lost.all() or lost.sum() > max(1.0, LOST * actuators):
+            if not (flat := share < 1.0).any() or not shrink(patterns, share, self._linear.stop):
                 break
-            others = patterns[:, ~lost].mean(axis=1, keepdims=True)
-            others[self._linear.stop :] = 0.0
-            patterns[:, lost] = 0.5 * (patterns[:, lost] + others)
-            less = flat & ~lost
-            patterns[1:, less] *= 0.999 * share[less]
             changed = changed | flat
-            law = self._law(patterns, creep, slope)
+            law, share = self._law(patterns, creep, slope)
             crept = self._with_creep(features, creep, patterns)
             residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)[1]
         return OwnFit(self.candidate, law, residual, patterns, creep, scatter, changed)
-
-    def _share_kept(self, law: HysteresisModel) -> Floats:
-        """(N,) share of its hysteresis that each law can keep and still be inverted safely; 1 or more = all of it."""
-        return np.asarray((1.0 - self._slope_min) / (1.0 - np.minimum(slope_min(law, *self.run.in_use), 0.999)))
 
     def _features(self, slope: Floats) -> Floats:
         """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""
@@ -198,9 +192,11 @@ class OwnLaws:
         return self.run.along(lambda signals: fading_changes(signals, slope, self.run.rest))
 
     def _rounds(
-        self, features: Floats, keep: Bools, patterns: Floats, creep: Floats, scatter: Floats
+        self, features: Floats, keep: Bools, patterns: Floats, creep: Floats, scatter: Floats, rise: Floats | None
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after all rounds.
+
+        With `rise`, the coefficients of the Duhem operators, laws are made to rise everywhere.
 
         Laws with so many weights follow outliers, so each round leaves out those of the last one: see OUTLIER_OF_FIT.
         """
@@ -218,7 +214,11 @@ class OwnLaws:
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
             due = self.spread is None and number == self._rounds_needed // 2 and len(free) >= SPREAD_MAPS * len(gains)
-            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, due)
+            known = None
+            if rise is not None:
+                law = self._as_fitted(patterns * sigma[:, None], creep, rise)
+                known = self._steepness.known(law, patterns[self._patterned], len(patterns) - 1)
+            patterns = self._patterns(patterns, crept[keep], gains / scatter, measured, free, due, known)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -226,20 +226,21 @@ class OwnLaws:
             gains, residual = self.run.gains(np.einsum("mfn,fn->mn", crept, patterns), keep)
         return patterns * sigma[:, None], creep, scatter, residual
 
-    def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
+    def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> tuple[HysteresisModel, Floats]:
+        """The law with these weights, normalised, and the share (N,) of its hysteresis that each actuator can keep."""
+        law = normalised(self._as_fitted(patterns, creep, slope), *self.run.reach)
+        return law, self._steepness.share_kept(law)
+
+    def _as_fitted(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
         """The law with the weights `patterns` (F, N) and `creep` (J + L + 1, N)."""
         radius, orders = self.candidate.radius, self.candidate.powers
-        series = (self._basis @ patterns[self._patterned]).T.reshape(-1, len(radius), orders)
-        powers = [
-            np.pad(legendre.leg2poly([0.0] * order + [1.0]), (0, orders - order)) for order in range(1, orders + 1)
-        ]
-        play_weight = series @ np.array(powers)[:, 1:]
+        play_weight = play_weights((self._basis @ patterns[self._patterned]).T.reshape(-1, len(radius), orders))
         play_weight[:, 0, 0] += patterns[0]
         linear = patterns[self._linear].T
         share, lag = np.maximum(creep[ELEMENTS].T, 0.0), creep[LAGGED].T
         mean = float(share.mean())
         share[:, :LAGS] += lag
-        law = HysteresisModel(
+        return HysteresisModel(
             radius,
             play_weight,
             slope,
@@ -252,7 +253,6 @@ class OwnLaws:
             fading_rate=FADING_RATE if linear.size else NONE,
             fading_weight=linear.reshape(-1, len(FADING_RATE), FADING_POWERS) if linear.size else NO_DRIVE,
         )
-        return normalised(law, *self.run.reach)
 
     def _with_creep(self, features: Floats, creep: Floats, patterns: Floats) -> Floats:
         """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""
@@ -273,13 +273,13 @@ class OwnLaws:
         return self.run.responses.scatter(size)
 
     def _patterns(
-        self, begin: Floats, crept: Floats, gains: Floats, measured: Floats, free: Floats, find_spread: bool
+        self, begin: Floats, crept: Floats, gains: Floats, values: Floats, free: Floats, due: bool, known: Known | None
     ) -> Floats:
-        """Weights (F, N): 1 for the signal itself, the others from maps and prior; `find_spread`: estimate it first."""
-        left, features = without(measured - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
-        if find_spread:
+        """Weights (F, N): 1 for the signal itself, others from maps and prior; `due`: estimate their spread first."""
+        left, features = without(values - crept[:, 0] @ gains, free), without(crept[:, 1:], free)
+        if due:
             self.spread = likeliest_spread(features, left, gains, begin[1:])
-        solved = weights_of(features, left, gains, alike(features.shape[2], self.spread or SPREAD), begin[1:])
+        solved = weights_of(features, left, gains, alike(features.shape[2], self.spread or SPREAD), begin[1:], known)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(

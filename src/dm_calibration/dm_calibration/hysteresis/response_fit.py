@@ -18,6 +18,7 @@ from dm_calibration.hysteresis.responses import Responses, agreeing
 from dm_calibration.hysteresis.run import Run, basis_of, start_of, without
 from dm_common import Bools, Floats
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.mirror import actuators_text
 
 #: Laws that are compared: those of a calibration, and a quadratic one between the linear and the cubic.
 LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
@@ -135,18 +136,16 @@ def identify_response(
         raise ValueError("candidates: must be at least one law, the first of them common to all actuators")
     _check_apart(signals)
     brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
-    # N actuators make at most N patterns; elsewhere is only noise, which would hide the differences between laws.
-    powers = np.hstack((np.ones((len(signals), 1)), signals, np.square(signals)))[usable]
-    response = powers[:, 1:] @ np.linalg.lstsq(powers, brought[usable], rcond=None)[0][1:]
-    patterns: Floats = np.linalg.svd(response, full_matrices=False)[2][: signals.shape[1]].T
-    seen: Floats = brought @ patterns
+    patterns = _patterns(signals[usable], brought[usable])
+    seen = brought @ patterns
     run = Run(signals, seconds, Responses(seen, seen.shape[1], usable), start_of(shapes), shapes)
     found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
-    free = basis_of(np.hstack((run.figure, signals))[usable])
-    count, used = free.shape
+    fitted = basis_of(np.hstack((run.figure, signals))[usable])
     elsewhere = np.zeros_like(brought)
-    elsewhere[usable] = without((brought - seen @ patterns.T)[usable], free)
-    noise = np.square(elsewhere).sum() * count / (count - used) ** 2
+    elsewhere[usable] = without((brought - seen @ patterns.T)[usable], fitted)
+    count, columns = fitted.shape
+    # Mean square beside the patterns in a row that is left out, from the residuals of a fit that includes it.
+    noise = np.square(elsewhere).sum() / (count - columns) * count / (count - columns)
     error = np.nanmean(np.square(found.held_out), axis=0).sum()
     signal = brought[usable].var(axis=0).sum()
     law = found.fit.law
@@ -173,6 +172,16 @@ def identify_response(
     )
 
 
+def _patterns(signals: Floats, values: Floats) -> Floats:
+    """(D, P) orthonormal patterns of the responses of `values` (M, D) to `signals` (M, N) and their squares.
+
+    N actuators make at most N; elsewhere is only noise, which would hide the differences between laws.
+    """
+    powers = np.hstack((np.ones((len(signals), 1)), signals, np.square(signals)))
+    response = powers[:, 1:] @ np.linalg.lstsq(powers, values, rcond=None)[0][1:]
+    return np.asarray(np.linalg.svd(response, full_matrices=False)[2][: signals.shape[1]].T)
+
+
 def _signals(commands: ArrayLike, actuators: int | None = None) -> Floats:
     signals = numbers(commands, "commands")
     if signals.ndim != 2 or not signals.size or signals.shape[1] != (actuators or signals.shape[1]):
@@ -196,8 +205,8 @@ def _check_apart(signals: Floats) -> None:
     _, group, size = np.unique(signals[:, moving], axis=1, return_inverse=True, return_counts=True)
     together = moving[size[group.ravel()] > 1] + 1
     if together.size:
-        names = ", ".join(map(str, together.tolist()))
-        raise ValueError(f"commands: do not separate actuators {names}: each must move on its own in some row")
+        which = actuators_text(together)
+        raise ValueError(f"commands: do not separate {which}: each must move on its own in some row")
 
 
 def _seconds(times: ArrayLike | None, moved: ArrayLike | None, count: int) -> tuple[Floats, Floats | None]:

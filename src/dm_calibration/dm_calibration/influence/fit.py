@@ -24,6 +24,7 @@ from dm_calibration.influence.regression import (
     least_squares,
     make_design,
     regress,
+    variance_at_points,
 )
 from dm_calibration.influence.screening import FitOptions
 from dm_common import Bools, Floats, Ints
@@ -116,7 +117,9 @@ def fit_influence(
     reasons = screening.unusable(maps, options.valid_fraction_min)
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
     if all(reasons):
-        raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
+        rejected = maps.rejected(reasons)
+        first = f"; the first: {': '.join(rejected[0])}" if rejected else ""
+        raise TooFewMapsError(f"none of the {len(rejected)} maps is usable{first}")
     fitted = _fit_good(maps, reasons)
     for _ in range(int(screening.DROPPED_MAX * len(maps))):
         outlier = fitted.worst_outlier(options)
@@ -238,7 +241,12 @@ def _result_of(
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
 
     response = rms(coefficients[:, terms:], weight)
-    grades = quality.grade(response, standard_error, design.excited, rings, options)
+    # A point that scatters more than others, or has data in fewer maps, counts for less.
+    sag_variance = variance_at_points(design, counted[:, terms:])[design.drift :]
+    sag_variance *= np.maximum(variance[terms:], max(scatter**2, np.finfo(float).tiny))
+    peak = np.zeros(maps.actuators)
+    peak[design.excited] = (np.abs(coefficients[design.excited, terms:]) / np.sqrt(sag_variance)).max(axis=1)
+    grades = quality.grade(response, peak, standard_error, design.excited, rings, options)
     figure_sag = figure[:, terms:]
     # The figure of a resumed run is that of its last part: it may have changed while the run was interrupted.
     last = design.matrix[good.segment == good.segment[-1], : design.drift].any(axis=0)

@@ -106,6 +106,11 @@ class MapSet:
         return np.array([kind == StepKind.REFERENCE for kind in self.kind], dtype=bool)
 
     @property
+    def has_map(self) -> Bools:
+        """(M,) which hold a map; the others are commands without one, for the history of the actuators."""
+        return np.asarray(np.isfinite(np.hstack((self.coefficients, self.sag))).any(axis=1))
+
+    @property
     def degaussed(self) -> Bools:
         """(M,) which maps directly follow a degauss within the run."""
         again = np.concatenate(([False], np.diff(self.step) == 0))
@@ -138,6 +143,11 @@ class MapSet:
         change = np.diff(self.coefficients[:, PISTON_TILT:], axis=0)[same]
         change = change[np.isfinite(change).all(axis=1)]
         return 0.5 * np.square(change).mean(axis=0) if len(change) >= PAIRS_MIN else np.zeros(change.shape[1])
+
+    def rejected(self, reasons: Sequence[str]) -> list[tuple[str, str]]:
+        """Label and reason of each map measured that a fit has left out, by its `reasons` (M,); "" = it has not."""
+        rows = zip(self.label, reasons, self.has_map, strict=True)
+        return [(label, reason) for label, reason, seen in rows if reason and seen]
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:

@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from dm_calibration.influence.registration import Registration, bumps, only_terms, register, unit_responses
+from dm_calibration.influence.bumps import bumps, only_terms, unit_responses
+from dm_calibration.influence.registration import Registration, register
 from dm_common import Bools, Floats, Ints
+from dm_common.figures import counted
 from dm_common.geometry import pitch, rings
+from dm_common.mirror import actuators_text
 from dm_common.optics.sampling import SamplePoints
 from dm_common.values import check_array
 
@@ -27,8 +30,9 @@ OWN_PLACE = 1e-9
 LIKENESS_MIN = 0.4
 #: Least median correlation of the responses with the expected bumps; below it the configured arrangement is wrong.
 FIT_MIN = 0.75
-#: Two bumps explain a response if they leave less than this share of the squared residual of one bump, ...
-DOUBLED = 0.5
+#: Two bumps explain a response if one leaves more than the first of these shares of its square, as one of another shape
+#: at the rim hardly does, and both leave less than the second of what one leaves, ...
+ONE_LEAVES, DOUBLED = 0.05, 0.5
 #: ... and the smaller of them is at least this share of the larger.
 SECOND_MIN = 0.4
 #: An actuator is weak below this share of the median response of its ring, ...
@@ -100,14 +104,15 @@ def check_pokes(
     quiet = (silent | (size == 0.0)) & ~unmoved
     active = np.flatnonzero(~(quiet | unmoved))
     nothing = PokeCheck(None, np.arange(count))
-    quiet_said = findings = _named(quiet, "show{} no response above the noise")
+    quiet_said = findings = _named(quiet, "shows/show no response above the noise")
     if active.size < max(ANSWERS_MIN, ANSWERS_SHARE * (active.size + quiet.sum())):
         problem = (
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
             "small (poke_amplitude), the drive is off, or most channels are those of no actuator (mirror.channels); "
             "wiring and orientation cannot be checked"
             if quiet.any()
-            else f"only {active.size} actuators were moved: a check of wiring and orientation needs {ANSWERS_MIN}"
+            else f"{counted(active.size, 'actuator was', 'actuators were')} moved: a check of wiring and orientation "
+            f"needs {ANSWERS_MIN}"
         )
         return replace(nothing, findings=(problem, *findings))
     terms = only_terms(unit[active], points)
@@ -121,7 +126,8 @@ def check_pokes(
             )
             return replace(nothing, findings=(*findings, problem))
         registration = registered
-        expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points, terms)
+        seen, bump = registration.seen(x, y) / radius, registration.bump.scaled(1.0 / radius)
+        expected, height = bumps(seen, bump, points, terms)
         height = np.maximum(height, np.finfo(float).tiny)
         table = np.zeros((count, count))
         table[active] = (unit[active] * points.weight) @ expected.T
@@ -140,16 +146,18 @@ def check_pokes(
     pose, turned = _pose_findings(registration, pitch(x, y))
     if pose:  # an actuator at the rim may lie outside an aperture that is not centred on the mirror
         quiet_said = [f"{text} in the maps as they are now: check again once they are corrected" for text in quiet_said]
-    findings = quiet_said + pose + _sign_findings(np.sign(found), active) + _place_findings(place)
+    alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
+    unlike = alone & (np.abs(found) < LIKENESS_MIN)
+    # The sign of a response that looks like that of no actuator says nothing of the way in which one moves the surface.
+    signs = _sign_findings(np.sign(found) * ~unlike, pushes=np.isinf(registration.bump.edge))
+    findings = quiet_said + pose + signs + _place_findings(place)
     for actuator, pair in double.items():
         findings.append(
             f"actuator {actuator + 1} moves the surface at actuators {pair[0] + 1} and {pair[1] + 1} together"
         )
-    alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
-    unlike = alone & (np.abs(found) < LIKENESS_MIN)
-    findings += _named(unlike, "answer{} in a way that does not look like that of one actuator")
+    findings += _named(unlike, "answers/answer in a way that does not look like that of one actuator")
     weak = alone & ~unlike & _weak(size, height[place], rings(x, y)[place], alone)
-    findings += _named(weak, f"answer{{}} weakly, below {WEAK_SHARE:.0%} of the others of the ring")
+    findings += _named(weak, f"answers/answer weakly, below {WEAK_SHARE:.0%} of the others of the ring")
     return PokeCheck(registration, place, turned, tuple(findings))
 
 
@@ -196,7 +204,7 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
     Args:
         table: (N, N) correlations of each response with the bumps expected at each place.
         overlap: (N, N) of these bumps with each other.
-        height: (N,) rms of each bump for a peak of 1.
+        height: (N,) rms of each bump as raised by one actuator.
     """
     found: dict[int, tuple[int, int]] = {}
     apart = ~np.eye(len(overlap), dtype=bool)
@@ -210,7 +218,8 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
             both = (rise * rise.T > 0.0) & alike & alike.T
         explained[~(both & apart)] = 0.0
         best = np.unravel_index(explained.argmax(), explained.shape)
-        if explained[best] > 0.0 and 1.0 - explained[best] < DOUBLED * (1.0 - np.square(row).max()):
+        left = 1.0 - np.square(row).max()
+        if explained[best] > 0.0 and left > ONE_LEAVES and 1.0 - explained[best] < DOUBLED * left:
             found[actuator] = (int(min(best)), int(max(best)))
     return found
 
@@ -251,26 +260,29 @@ def _place_findings(place: Ints) -> list[str]:
             chain = ", ".join(
                 f"{a} moves the surface at {b}" for a, b in zip(numbers, numbers[1:] + numbers[:1], strict=True)
             )
-            findings.append(f"actuators {', '.join(map(str, numbers))} are permuted: {chain}")
+            findings.append(actuators_text(numbers, f"are permuted: {chain}"))
     return findings
 
 
-def _sign_findings(sign: Floats, active: Ints) -> list[str]:
-    negative = sign < 0
-    if 2 * negative.sum() <= active.size:
-        return _named(negative, "move{} the surface the opposite way")
-    if negative.sum() == active.size:
+def _sign_findings(sign: Floats, pushes: bool) -> list[str]:
+    """Sentences on the signs (N,) of the responses; 0 = not known.
+
+    Args:
+        pushes: a rising signal raises the surface, as with stacks; membranes are pulled, bimorphs bend either way.
+    """
+    negative, known = sign < 0, np.count_nonzero(sign)
+    if 2 * negative.sum() <= known:
+        return _named(negative, "moves/move the surface the opposite way")
+    if negative.sum() == known and not pushes:
+        return []
+    if negative.sum() == known:
         return [
             "all actuators move the surface the opposite way: a rising signal lowers it; "
             "check the sign of the maps and the polarity of the electronics"
         ]
-    return _named(sign > 0, "move{} the opposite way to most others, which lower the surface as the signal rises")
+    return _named(sign > 0, "moves/move the opposite way to most others, which lower the surface as the signal rises")
 
 
 def _named(which: Bools, text: str) -> list[str]:
-    """ "actuator 3 <text with s for {}>" or "actuators 3, 7 <text without>"; nothing when there is none."""
-    numbers = np.flatnonzero(which) + 1
-    if numbers.size == 0:
-        return []
-    one = numbers.size == 1
-    return [f"actuator{'' if one else 's'} {', '.join(map(str, numbers))} {text.format('s' if one else '')}"]
+    """The finding on the actuators `which` (N,), as from `actuators_text`; nothing when there is none."""
+    return [actuators_text(np.flatnonzero(which) + 1, text)] if which.any() else []

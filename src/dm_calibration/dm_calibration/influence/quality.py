@@ -7,7 +7,9 @@ from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.regression import Design, seen_alike
 from dm_calibration.influence.screening import FitOptions
 from dm_common import Bools, Floats, Ints
+from dm_common.figures import counted
 from dm_common.limits import Limits
+from dm_common.mirror import actuators_text
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -15,6 +17,9 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 EXTRAPOLATION_MAX = 10.0
 #: An actuator is dead if its response is up to this share of the median response of all excited actuators.
 DEAD_SHARE = 0.02
+#: An actuator beside the aperture moves few points of it, which count little in the rms sag. So it is not dead if one
+#: point moves by this many times as many standard errors of its own as its rms response would need.
+PEAK_RATIO = 2.0
 
 #: An actuator is uncertain if its relative error exceeds this many times the median: an error that all share, such as
 #: that of hysteresis in pokes, is no sign of a bad actuator.
@@ -42,11 +47,12 @@ NO_RESPONSE = (GRADE_DEAD, GRADE_NOT_EXCITED)
 
 
 def grade(
-    response: Floats, standard_error: Floats, excited: Bools, rings: Ints | None, options: FitOptions
+    response: Floats, peak: Floats, standard_error: Floats, excited: Bools, rings: Ints | None, options: FitOptions
 ) -> NDArray[np.uint8]:
-    """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal.
+    """Grade of each actuator from its response (N,) and standard error (N,), m per unit signal, and its peak (N,).
 
-    A response is the weighted rms sag of a unit signal, piston and tilt removed.
+    A response is the weighted rms sag of a unit signal, piston and tilt removed; a peak is the largest sag of a point,
+    in standard errors of that point.
     """
     uncertainty, typical = _uncertainty(response, standard_error, excited)
     uncertain = (uncertainty > UNCERTAIN_RATIO * typical) & (response < options.weak_sigmas * standard_error)
@@ -55,7 +61,8 @@ def grade(
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
-    dead = (response < options.dead_sigmas * standard_error) | (response <= DEAD_SHARE * overall)
+    noise = (response < options.dead_sigmas * standard_error) & (peak < PEAK_RATIO * options.dead_sigmas)
+    dead = noise | (response <= DEAD_SHARE * overall)
     weak = uncertain | (response < options.weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
@@ -196,13 +203,12 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
             "its drift."
         )
     for value, text in (
-        (GRADE_WEAK, "respond weakly or uncertainly"),
-        (GRADE_DEAD, "show no response above the noise"),
-        (GRADE_NOT_EXCITED, "were never moved and count as without effect"),
+        (GRADE_WEAK, "responds/respond weakly or uncertainly"),
+        (GRADE_DEAD, "shows/show no response above the noise"),
+        (GRADE_NOT_EXCITED, "was/were never moved and counted as without effect"),
     ):
-        numbers = np.flatnonzero(grades == value) + 1
-        if numbers.size:
-            sentences.append(f"Actuators {', '.join(map(str, numbers))} {text}.")
+        if finding := actuators_text(np.flatnonzero(grades == value) + 1, text):
+            sentences.append(f"{finding.capitalize()}.")
     if not tested.any():
         sentences.append(
             "Every map moves an actuator as no other map does: the held-out error comes from extrapolation and says "
@@ -210,8 +216,8 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         )
     elif untested := int((~tested & ~good.reference).sum()):
         sentences.append(
-            f"{untested} maps move an actuator as no other map does; predicting them from the others would be "
-            "extrapolation, so they do not count in the held-out error."
+            f"{counted(untested, 'map moves', 'maps move')} an actuator as no other map does; a prediction from the "
+            "others would be extrapolation and does not count in the held-out error."
         )
     blind = sum(len(one.points) for one in seen_alike(design, np.isfinite(good.sag)) if one.inverse is None)
     if blind:

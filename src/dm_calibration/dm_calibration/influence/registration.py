@@ -2,7 +2,8 @@
 
 A poke raises a broad bump over its actuator. Each bump is located by itself. The bumps are assigned one to one to the
 configured places (Hungarian method), alternating with the fit of a similarity (iterative closest point), from start
-angles around the full circle; the best similarity is refined on the maps themselves.
+angles around the full circle; the best similarity is refined on the maps themselves, with the shape of the bumps: that
+of a plate on actuators, or of a membrane or bimorph held at its edge, whichever fits better.
 
 A regular arrangement looks the same after some turns: a turned mirror then cannot be distinguished from one whose
 numbering begins elsewhere. Of the descriptions that fit equally well, the one is taken that leaves most actuators where
@@ -13,20 +14,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 
+from dm_calibration.influence.bumps import Bump, Places, bumps
 from dm_common import Bools, Floats, Ints
 from dm_common.geometry import pitch
-from dm_common.optics.piston_tilt import remove_piston_tilt, rms, weighted_fit
 from dm_common.optics.sampling import SamplePoints
-from dm_common.optics.zernike import basis
-
-#: Places in the plane as complex numbers, x + iy.
-Places = NDArray[np.complex128]
 
 #: Widths tried for the expected bumps (standard deviation, in pitches); a stiffer plate answers more broadly.
 WIDTHS = (0.5, 0.7, 0.9, 1.15, 1.5)
+#: Radius, in those of the aperture, at which the search for the edge of a membrane begins if actuators lie inside it.
+EDGE_START = 1.4
+#: A search that ends with the edge nearer to the outermost actuator than this share of the width has found no edge.
+EDGE_GAP = 0.02
 #: Bumps are looked for up to this distance from the centre of the aperture, in its radii, ...
 REACH = 1.45
 #: ... on a grid of this spacing, in pitches, but no finer than this, in radii, so that two configured places that are
@@ -58,8 +58,6 @@ SCALE_BIAS = 0.005
 #: The same for scale if maps consist of terms only, which may have been fitted over a larger aperture.
 SCALE_BIAS_OF_TERMS = 0.02
 SHIFT_BIAS = 0.02
-#: Rms share of the responses beyond the Zernike terms, below which the maps count as consisting of terms only.
-ONLY_TERMS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class Registration:
         shift: (2,) x and y of the mirror's origin from the centre of the aperture, m.
         scale: distances seen / configured.
         turn_sigma, shift_sigma, scale_sigma: standard errors, in the same units.
-        width: of a bump, standard deviation, m.
+        bump: shape of the surface over an actuator, m.
     """
 
     turn: float
@@ -84,7 +82,7 @@ class Registration:
     turn_sigma: float
     shift_sigma: float
     scale_sigma: float
-    width: float
+    bump: Bump
 
     def seen(self, x: Floats, y: Floats) -> Places:
         """Where actuators configured at `x`, `y` (m) are seen, m from the centre of the aperture."""
@@ -110,31 +108,6 @@ class _Match(NamedTuple):
 
 def _seen(similarity: _Similarity, places: Places) -> Places:
     return similarity.factor * (-places.conj() if similarity.mirrored else places) + similarity.shift
-
-
-def bumps(places: Places, width: float, points: SamplePoints, terms: Floats | None = None) -> tuple[Floats, Floats]:
-    """Bumps of unit height at `places` (N,), in radii of the aperture as is `width`: see :func:`unit_responses`.
-
-    Args:
-        terms: (P, K) the terms to which the sensor reduces a surface; None = it shows everything.
-    """
-    distance = np.abs(places[:, None] - (points.x + 1j * points.y))
-    sag = np.exp(-0.5 * np.square(distance / width))
-    return unit_responses(sag if terms is None else weighted_fit(sag, terms, points.weight) @ terms.T, points)
-
-
-def only_terms(unit: Floats, points: SamplePoints) -> Floats | None:
-    """(P, 21) Zernike terms if the responses (A, P) contain nothing else, as those of a sensor; None = they do."""
-    terms = basis(points.x, points.y)
-    left = rms(unit - weighted_fit(unit, terms, points.weight) @ terms.T, points.weight)
-    return terms if np.max(left) < ONLY_TERMS else None
-
-
-def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
-    """Rows of `sag` (N, P) without piston and tilt, scaled to unit rms, and the rms (N,) of each before."""
-    left = remove_piston_tilt(sag, points)
-    size = rms(left, points.weight)
-    return np.asarray(left / np.maximum(size, np.finfo(float).tiny)[:, None]), np.asarray(size)
 
 
 def register(
@@ -166,7 +139,7 @@ def _located(unit: Floats, points: SamplePoints, step: float, terms: Floats | No
     line = np.arange(-REACH, REACH + spacing, spacing)
     grid = (line[:, None] + 1j * line).ravel()
     grid = grid[np.abs(grid) <= REACH]
-    tables = [np.abs((unit * points.weight) @ bumps(grid, width * step, points, terms)[0].T) for width in WIDTHS]
+    tables = [np.abs((unit * points.weight) @ bumps(grid, Bump(width * step), points, terms)[0].T) for width in WIDTHS]
     best = int(np.argmax([table.max(axis=1).mean() for table in tables]))
     return grid[tables[best].argmax(axis=1)], WIDTHS[best] * step
 
@@ -228,7 +201,7 @@ def _closest(seen: Places, places: Places, start: _Similarity, step: float) -> _
 def _refined(
     match: _Match, unit: Floats, points: SamplePoints, places: Places, width: float, radius: float, terms: Floats | None
 ) -> Registration:
-    """Fit similarity and width to the maps of actuators inside the aperture, if possible away from the rim (INNER)."""
+    """Fit similarity and shape to the maps of actuators inside the aperture, if possible away from the rim (INNER)."""
     away = np.abs(places - places.mean())[match.place]
     inside = match.placed & (np.abs(_seen(match.similarity, places)[match.place]) < 1.0)
     inner = inside & (away <= INNER * np.abs(places - places.mean()).max())
@@ -237,23 +210,31 @@ def _refined(
         use[:] = True
     mirrored, root = match.similarity.mirrored, np.sqrt(points.weight)
 
-    def residual(values: Floats, chosen: Bools) -> Floats:
+    def described(values: Floats) -> tuple[Places, Bump]:
         factor = np.exp(values[0] + 1j * values[1])
-        similarity = _Similarity(factor, complex(values[2], values[3]), mirrored)
-        expected, _ = bumps(_seen(similarity, places[match.place[chosen]]), np.exp(values[4]), points, terms)
+        seen = _seen(_Similarity(factor, complex(values[2], values[3]), mirrored), places)
+        outermost = max(1.0, float(np.abs(seen).max()))  # the edge is beyond all actuators and the aperture
+        return seen, Bump(np.exp(values[4]), *(outermost + np.exp(values[5:])))
+
+    def residual(values: Floats, chosen: Bools) -> Floats:
+        seen, bump = described(values)
+        expected, _ = bumps(seen[match.place[chosen]], bump, points, terms)
         measured = unit[chosen]
         share = (measured * expected) @ points.weight  # the expected bumps are of unit rms
         return np.asarray(root * (measured - share[:, None] * expected))
 
     logarithm, shift = np.log(match.similarity.factor), match.similarity.shift
-    start = np.array([logarithm.real, logarithm.imag, shift.real, shift.imag, np.log(width)])
-    fitted = least_squares(lambda values: residual(values, use).ravel(), start)
+    plate = np.array([logarithm.real, logarithm.imag, shift.real, shift.imag, np.log(width)])
+    starts = (plate, np.append(plate, np.log(EDGE_START - 1.0)))
+    fits = [least_squares(lambda values: residual(values, use).ravel(), start) for start in starts]
+    sound = (fit for fit in fits if (fit.x[5:] - fit.x[4] > np.log(EDGE_GAP)).all())
+    fitted = min(sound, key=lambda fit: float(fit.cost))
     left = np.linalg.norm(fitted.fun.reshape(-1, len(points)), axis=1)
     good = left <= 3.0 * np.median(left)
     if not good.all() and good.sum() >= 3:  # again without those that respond differently
         use[np.flatnonzero(use)[~good]] = False
         fitted = least_squares(lambda values: residual(values, use).ravel(), fitted.x)
-    sigma = _standard_errors(fitted.jac.reshape(-1, len(points), start.size), fitted.fun.reshape(-1, len(points)))
+    sigma = _standard_errors(fitted.jac.reshape(-1, len(points), fitted.x.size), fitted.fun.reshape(-1, len(points)))
     values, scale = fitted.x, float(np.exp(fitted.x[0]))
     metres = (float(values[2] * radius), float(values[3] * radius))
     return Registration(
@@ -264,7 +245,7 @@ def _refined(
         turn_sigma=float(sigma[1]),
         shift_sigma=float(np.hypot(max(sigma[2], sigma[3]) * radius, SHIFT_BIAS * np.hypot(*metres))),
         scale_sigma=float(np.hypot(sigma[0], SCALE_BIAS if terms is None else SCALE_BIAS_OF_TERMS) * scale),
-        width=float(np.exp(values[4]) * radius),
+        bump=Bump(*map(float, described(values)[1].scaled(radius))),
     )
 
 

@@ -21,6 +21,7 @@ import scipy.linalg
 from dm_calibration.influence.maps import MapSet
 from dm_common import Bools, Floats, Ints
 from dm_common.errors import CodedError, ErrorCode
+from dm_common.mirror import actuators_text
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 
@@ -147,8 +148,8 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     if singular[-1] < RANK_TOLERANCE * singular[0]:
         null = right[singular < RANK_TOLERANCE * singular[0]][:, design.drift :]
         involved = np.flatnonzero(design.excited)[np.abs(null).max(axis=0) > 0.02] + 1
-        names = ", ".join(str(number) for number in involved) or "all"
-        raise TooFewMapsError(f"the maps do not separate actuators {names}: each must move on its own in some map")
+        which = actuators_text(involved) or "the actuators"
+        raise TooFewMapsError(f"the maps do not separate {which}: each must move on its own in some map")
     coefficients = scipy.linalg.solve_triangular(r, q.T @ responses)
     inverse = scipy.linalg.solve_triangular(r, np.eye(r.shape[0]))
     return Regression(
@@ -181,6 +182,19 @@ def seen_alike(design: Design, seen: Bools) -> list[SeenAlike]:
         value, vector = np.linalg.eigh(np.eye(len(lost)) - lost @ lost.T)
         inverse = (vector / value) @ vector.T if value.min(initial=1.0) > SEEN_MIN else None
         found.append(SeenAlike(np.flatnonzero(which.ravel() == number), lost, inverse))
+    return found
+
+
+def variance_at_points(design: Design, seen: Bools) -> Floats:
+    """(p, P) variance of the coefficients of each point, for responses of unit variance, from the maps `seen` (M, P)
+    that have data there; infinite where these do not determine the unknowns.
+    """
+    loading = np.linalg.inv(design.basis.T @ design.matrix)
+    found = np.full((len(loading), seen.shape[1]), np.inf)
+    for at, lost, inverse in seen_alike(design, seen):
+        if inverse is not None:
+            along = lost @ loading.T
+            found[:, at] = (np.square(loading).sum(axis=1) + (along * (inverse @ along)).sum(axis=0))[:, None]
     return found
 
 

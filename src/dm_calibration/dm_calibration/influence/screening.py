@@ -6,6 +6,7 @@ import numpy as np
 
 from dm_calibration.influence.maps import MapSet, StepKind
 from dm_calibration.influence.weights import check_epsilon
+from dm_common.errors import beside
 from dm_common.values import live_parameter, real
 
 #: Median absolute deviation to standard deviation, for normal errors.
@@ -55,7 +56,10 @@ class FitOptions:
         "the loop, whose width is 7-15 % of the move) before the map is an outlier. 0 = no hysteresis: the error "
         "promised for moves is then that of held-out maps.",
     )
-    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead if the response is below this many standard errors.")
+    dead_sigmas: float = live_parameter(
+        real(3.0, 0.0, 1e3),
+        "Dead if the rms response is below this many standard errors, and that of every point below twice as many.",
+    )
     weak_sigmas: float = live_parameter(
         real(10.0, 0.0, 1e3), "Weak below this many standard errors, if the relative error exceeds twice the median."
     )
@@ -88,10 +92,12 @@ def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
         elif np.isinf(sag).any():
             reason = "a sag sample is infinite"
         elif not valid >= valid_fraction_min:
-            reason = f"too few valid pixels: {valid:.1%} of the aperture, at least {valid_fraction_min:.0%} are needed"
+            share = beside(".1%", valid, valid_fraction_min)
+            reason = f"too few valid pixels: {share} of the aperture, at least {valid_fraction_min:.0%} are needed"
         elif partial:
             reason = f"a part of the surface is missing: {valid:.1%} of the aperture is valid, in most maps {usual:.1%}"
         elif missing > MISSING_POINTS_MAX:
-            reason = f"{missing:.1%} of the sampling points have no data: must be at most {MISSING_POINTS_MAX:.0%}"
+            share = beside(".1%", missing, MISSING_POINTS_MAX)
+            reason = f"{share} of the sampling points have no data: must be at most {MISSING_POINTS_MAX:.0%}"
         reasons.append(reason)
     return reasons

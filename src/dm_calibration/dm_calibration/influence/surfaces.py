@@ -135,14 +135,12 @@ def solve_shape(
 def largest_step(start: Floats, direction: Floats, mirror: Mirror) -> float:
     """Largest t >= 0 for which start + t direction keeps the range and the neighbour limit; 0 when start breaks one."""
     limits, (a, b) = mirror.limits, mirror.limits.pairs.T
-    value, slope = np.append(start, start[a] - start[b]), np.append(direction, direction[a] - direction[b])
-    high = np.append(np.full(start.size, limits.high), np.full(a.size, limits.neighbour_difference))
-    low = np.append(np.full(start.size, limits.low), np.full(a.size, -limits.neighbour_difference))
-    room = np.where(slope > 0, high - value, value - low)
+    value = np.append(start - limits.middle, start[a] - start[b])
+    slope = np.append(direction, direction[a] - direction[b])
+    most = np.append(np.full(start.size, limits.half_range), np.full(a.size, limits.neighbour_difference))
     moving = np.abs(slope) > 1e-12
-    if not moving.any():
-        return 0.0
-    return max(0.0, float((room[moving] / np.abs(slope[moving])).min()))
+    steps = (most - np.sign(slope) * value)[moving] / np.abs(slope[moving])
+    return max(0.0, float(steps.min())) if steps.size else 0.0
 
 
 def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:

@@ -69,8 +69,10 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         ValueError: no tests, maps of different sizes, or maps that determine no angular order.
         InsufficientDataError: the maps share no aperture, or too few of its pixels for the terms.
     """
-    if len({test.sag.shape for test in tests}) != 1:
-        raise ValueError(f"{len(tests)} maps: must be some, all of one size in pixels")
+    sizes = sorted({"{1} x {0}".format(*test.sag.shape) for test in tests})
+    if len(sizes) != 1:
+        found = f", not of {', '.join(sizes)}" if sizes else ""
+        raise ValueError(f"{len(tests)} maps: must be some, all of one size in pixels{found}")
     shared = np.logical_and.reduce([np.isfinite(test.sag) for test in tests])
     aperture = find_aperture(shared)
     disc = aperture.disc(shared.shape)

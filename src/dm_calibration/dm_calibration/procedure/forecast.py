@@ -49,7 +49,7 @@ class Forecast:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
         source = (
-            ", median of mirrors drawn at random; one in ten errs twice as much, other kinds of mirrors more"
+            ", median of mirrors drawn at random; one in ten errs twice as much, other kinds up to 20 times"
             if self.typical
             else ""
         )

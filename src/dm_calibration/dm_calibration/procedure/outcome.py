@@ -127,6 +127,11 @@ class Outcome:
                 self._doubt(event)
 
     @property
+    def measured(self) -> int:
+        """Number of maps; `records` may hold commands without one as well."""
+        return sum(record.has_map for record in self.records)
+
+    @property
     def radius_known(self) -> bool:
         """Whether all maps contain their aperture radius."""
         return all(record.radius > 0.0 for record in self.records)
@@ -164,9 +169,7 @@ class Outcome:
 
     def _doubt(self, event: Doubted) -> None:
         doubtful = self.records[event.kept :]
-        self.dropped += [
-            f"{record.label}: {event.reason}" for record in doubtful if np.isfinite(record.coefficients).any()
-        ]
+        self.dropped += [f"{record.label}: {event.reason}" for record in doubtful if record.has_map]
         # Maps that failed meanwhile may have failed for the same reason.
         failed = [drop for before, drop in self._drops if before >= event.kept and not drop.whole]
         for drop in failed:

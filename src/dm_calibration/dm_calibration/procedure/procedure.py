@@ -26,6 +26,7 @@ from dm_calibration.procedure.outcome import (
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, shape_in_use
 from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
+from dm_common.figures import counted
 from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import APERTURE_TOLERANCE, Mirror
 from dm_common.values import live_parameter, whole
@@ -251,12 +252,13 @@ class Procedure:
                 f"{label}: {suspicion}: the mirror is not where it was before the run was interrupted. Put it back, "
                 "or begin anew (`dm calibrate --fresh`)",
             )
-        frames = [index for index, record in enumerate(self.outcome.records) if record.kind == StepKind.REFERENCE]
-        doubtful = len(self.outcome.records) - frames[-1] - 1
-        self._note(Doubted(frames[-1] + 1, f"in doubt, bumped before {label}"))
+        records = self.outcome.records
+        kept = max(index for index, record in enumerate(records, 1) if record.kind == StepKind.REFERENCE)
+        since = counted(sum(record.has_map for record in records[kept:]), "map since is", "maps since are")
+        self._note(Doubted(kept, f"in doubt, bumped before {label}"))
         raise Refusal(
             ErrorCode.MAP_REJECTED,
-            f"{label}: {suspicion}: the mirror or the interferometer was bumped. The {doubtful} maps since are in "
+            f"{label}: {suspicion}: the mirror or the interferometer was bumped, and {since} in "
             "doubt; put the mirror back and start again to go on from the last good reference frame",
         )
 

@@ -16,6 +16,7 @@ from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions
 from dm_calibration.procedure.run_journal import Kept, RunJournal
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.atomic_write import StoreError
+from dm_common.figures import counted
 from dm_common.mirror import Mirror
 
 #: Free space required for each map, in the journal and then in the calibration [bytes].
@@ -107,7 +108,7 @@ def open_run(
             chosen = found
             continue
         runs.set_aside(found.folder)
-        notes.append(f"unfinished run {found.folder.name} ({found.maps} maps) is set aside: {reason}")
+        notes.append(f"unfinished run {found.folder.name} ({counted(found.maps, 'map')}) is set aside: {reason}")
     notes += [f"{name} deleted: too many unfinished runs" for name in runs.prune(chosen.folder if chosen else None)]
     about = {"software_version": software_version(), "created_ns": time.time_ns(), "note": note}
     journal = RunJournal.reopen(chosen.folder) if chosen else runs.begin(identity, about)
@@ -120,7 +121,7 @@ def open_run(
         return OpenRun(journal, Outcome(remarks=list(plan.remarks)), notes=tuple(notes))
     if chosen.torn:
         notes.append(f"unfinished run {chosen.folder.name}: the last {chosen.torn} bytes are incomplete and ignored")
-    text = f"resumed run {chosen.folder.name} with {len(chosen.outcome.records)} maps"
+    text = f"resumed run {chosen.folder.name} with {counted(chosen.outcome.measured, 'map')}"
     return OpenRun(journal, chosen.outcome, chosen.storing, text, tuple(notes))
 
 

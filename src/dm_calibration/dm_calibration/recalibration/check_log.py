@@ -6,9 +6,7 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, Self
-
-from dm_calibration.recalibration.drift import Comparison, Drift
+from typing import Any
 
 SUFFIX = ".checks.csv"
 
@@ -36,13 +34,6 @@ class Check:
     gain_drift: float
     actuator: int
     offset_drift: float
-
-    @classmethod
-    def of(cls, stamp_ns: int, accepted: bool, shown: Comparison, drift: Drift) -> Self:
-        """The check of a map taken at `stamp_ns`, with the drift as it is used after this map."""
-        gain, actuator = drift.largest_gain
-        departure = shown.max_zernike, shown.rms, shown.surprise
-        return cls(1e-9 * stamp_ns, int(accepted), *departure, gain, actuator + 1, drift.offset_rms)
 
 
 def append_check(file: Path, check: Check) -> None:

@@ -7,10 +7,10 @@ from scipy.linalg import solve_triangular
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.responses import Reduction
+from dm_calibration.influence.bumps import Bump, bumps
 from dm_calibration.influence.quality import NO_RESPONSE
-from dm_calibration.influence.registration import bumps
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.drift import Displaced
+from dm_calibration.recalibration.drift import DEAD_SHARE, DISTINCT_SIGNAL, FAILED_SIGNAL, Displaced, Drift
 from dm_common import Bools, Floats
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import weighted_fit
@@ -23,12 +23,8 @@ DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 DISPLACED_SIGMA = 0.5
 #: The same of a change of one coefficient, as by another focus of the interferometer, m rms.
 TERM_SIGMA = 1e-7
-#: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
-#: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
-DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
-#: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
-#: displacements of up to 0.03; and at which it is named where the map agrees.
-FAILED_SIGNAL, NOTICED = 0.05, 0.01
+#: Least displacement, in effective signal, at which an actuator is named where the map agrees.
+NOTICED = 0.01
 #: An actuator counts as failed beyond this many standard deviations from where it should stand.
 DISPLACED_SIGMAS = 4.0
 #: No actuator stands at an effective signal beyond this.
@@ -55,7 +51,7 @@ def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -
         return gain
     radius, points = calibration.aperture_radius, calibration.fit.points
     x, y = calibration.actuator_x / radius, calibration.actuator_y / radius
-    shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
+    shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), Bump(TYPICAL_WIDTH * pitch(x, y)), points)
     sag = TYPICAL_RISE * size[:, None] * shape
     coefficients = weighted_fit(sag, basis(points.x, points.y), points.weight)
     return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
@@ -214,6 +210,30 @@ def noticed_error(displaced: Mapping[int, Displaced], zernike: Floats) -> float:
     return float((np.abs(zernike[PISTON_TILT:]) @ away).max())
 
 
+def failing_from(displaced: Mapping[int, Displaced], expected: Floats, drift: Drift, shown: Bools) -> Floats:
+    """`failing` of :class:`Drift` after a map.
+
+    A weakened actuator misses the same share of every move, so near 0 it stands where it should.
+
+    Args:
+        displaced, expected: as of :func:`worst_other_error`; only failed actuators count.
+        drift: before the map.
+        shown: (N,) whether the map would have shown it of each, see :func:`shown_at`.
+    """
+    failing = np.where(shown, np.nan, drift.failing)
+    for actuator, one in displaced.items():
+        if failed(one) and np.isnan(drift.stuck[actuator]):
+            failing[actuator] = FAILED_SIGNAL * abs(expected[actuator] / one.more)
+    return failing
+
+
+def shown_at(effective: Floats, drift: Drift) -> Bools:
+    """(N,) whether a map at the signals `effective` (N,) would show that actuators still fail, see :class:`Drift`."""
+    moves = np.isnan(drift.stuck)
+    away = np.where(moves, effective, (effective - drift.failing) * drift.stuck / drift.failing)
+    return np.abs(away) >= np.where(moves, drift.failing, FAILED_SIGNAL)
+
+
 def noticed(one: Displaced) -> bool:
     """Whether an actuator is surely somewhere else, if only so little that the map agrees."""
     return one.probability >= SURE and abs(one.more) >= NOTICED
@@ -231,4 +251,4 @@ def _fault(signal: float, more: float) -> str:
     share = 1.0 + more / signal
     if abs(share) < DEAD_SHARE:
         return ", as if it were dead"
-    return f", as if weakened to {share:.0%}" if DEAD_SHARE <= share < 1.0 - DEAD_SHARE else ""
+    return f", as if weakened to {share:.0%}" if DEAD_SHARE <= share < 1.0 - NOTICED else ""

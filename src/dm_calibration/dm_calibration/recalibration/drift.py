@@ -1,14 +1,15 @@
 """The drift of a calibrated mirror, as estimated from later maps."""
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.special import ndtri
 
 from dm_common import Floats
-from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.mirror import APERTURE_TOLERANCE, actuators_text
+from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import GOES_ON_WITHOUT
 from dm_common.values import live_parameter, parameter, real, whole
 
@@ -18,6 +19,12 @@ WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 
 #: Mean square of the surprise of a few maps that may be due to chance.
 MISFIT_BY_CHANCE = 1.5
+#: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
+#: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
+DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
+#: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
+#: displacements of up to 0.03.
+FAILED_SIGNAL = 0.05
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,9 @@ class Drift:
         evidence: (2, 2) sum of squares of the changes predicted for maps, in standard deviations, and sum of their
             products with the measured changes; first row: gain and figure, second row: changes by temperature.
         stuck: (N,) effective signals at which actuators are stuck; NaN = the actuator moves.
+        failing: (N,) least effective signals, of either sign, at which maps would show that actuators fail, which
+            earlier maps showed; of stuck ones, the signal at which they were found if they may only be weakened; NaN =
+            the actuator follows its commands, or is surely stuck.
         temperatures: (3,) degC: reference for gain and offset, lowest and highest of the maps; NaN = not known.
     """
 
@@ -81,6 +91,7 @@ class Drift:
     covariance: Floats
     stamp_ns: int
     stuck: Floats
+    failing: Floats
     temperatures: Floats
     evidence: Floats = field(default_factory=lambda: np.zeros((2, 2)))
     revision: int = 0
@@ -118,12 +129,31 @@ class Drift:
         """Where the actuators stand when `effective` (N,) is commanded."""
         return np.where(np.isnan(self.stuck), effective, self.stuck)
 
+    def fixed(self, stuck: Floats, effective: Floats, zernike: Floats) -> Self:
+        """The same with actuators that stand at `stuck` (N,), NaN = moves, from a map at the signals `effective` on.
+
+        One that stands between 0 and its signal may as well be weakened: then its next move makes an error. So may one
+        that was given up before and now stands elsewhere.
+
+        Args:
+            zernike: (K, N) m per unit of effective signal.
+        """
+        share = np.divide(stuck, effective, out=np.zeros_like(stuck), where=np.abs(effective) >= DISTINCT_SIGNAL)
+        new = np.isnan(self.stuck) & np.isfinite(stuck)
+        elsewhere = np.abs(stuck - self.stuck) >= FAILED_SIGNAL
+        weak = (new | elsewhere) & (share >= DEAD_SHARE) & (share < 1.0)
+        error = float((np.abs(zernike[PISTON_TILT:]) @ np.where(weak, share * (1.0 + np.abs(effective)), 0.0)).max())
+        failing = np.where(weak, effective, np.where(new, np.nan, self.failing))
+        return replace(self, stuck=stuck, failing=failing, disagreement=max(self.disagreement, error))
+
     @property
     def given_up(self) -> str:
         """Sentence on the actuators that no longer move and where they stand; "" = all move."""
-        indices = np.flatnonzero(np.isfinite(self.stuck))
-        places = ", ".join(f"{index + 1} (fixed at {self.stuck[index]:+.2f})" for index in indices)
-        return f"{GOES_ON_WITHOUT}{'s' if indices.size > 1 else ''} {places}" if places else ""
+        weak = np.where(np.isfinite(self.failing), ", if not only weakened: check another shape", "")
+        places = [
+            f"{index + 1} (fixed at {at:+.2f}{weak[index]})" for index, at in enumerate(self.stuck) if np.isfinite(at)
+        ]
+        return f"{GOES_ON_WITHOUT} {actuators_text(places)}" if places else ""
 
     @property
     def largest_gain(self) -> tuple[float, int]:

@@ -111,8 +111,7 @@ class DriftFilter:
 
     def start(self, stamp_ns: int) -> Drift:
         """The drift at the time of the calibration: none, with the uncertainty of the calibration."""
-        fit, values = self._fit, self.reduction.size
-        shows = fit.response > 0.0
+        fit, values, shows = self._fit, self.reduction.size, self._fit.response > 0.0
         share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
         gain = np.square(np.minimum(share, GAIN_SIGMA_MAX))
         offset = (self._noise + np.diag(self._law)) / max(int(fit.used.sum()), 1) + fit.drift_rms**2 / values
@@ -125,6 +124,7 @@ class DriftFilter:
             covariance=np.diag(np.concatenate((gain, offset, warm, np.zeros(values)))),
             stamp_ns=stamp_ns,
             stuck=np.full(fit.actuators, np.nan),
+            failing=np.full(fit.actuators, np.nan),
             temperatures=np.full(3, self._temperature),
         )
 
@@ -202,7 +202,7 @@ class DriftFilter:
         stuck[actuators] = given_up_at(innovation, self._gain, seen.factor, actuators, at, moving)
         if (np.isfinite(stuck) | self._silent).all():
             raise MapNotUsableError("no actuator that responds would be left: calibrate anew")
-        return replace(drift, stuck=stuck)
+        return drift.fixed(stuck, effective, self._fit.influence_zernike)
 
     def _at(self, drift: Drift, stamp_ns: int) -> Drift:
         """`drift` as expected at `stamp_ns`, with its own stamp kept: creep fades, and the covariance grows."""

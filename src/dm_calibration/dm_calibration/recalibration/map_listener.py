@@ -107,8 +107,9 @@ class MapListener:
         self._published_at, self._dirty = time.monotonic(), False  # first: maps may show more meanwhile
         self._published_age_s = self._age_s
         if (kept := self._updates.in_use) is not None:
-            temperature, doubts = self._temperatures.published(), self._doubts()
-            put_updates(message, kept, temperature, doubts, self._updates.mirror_changed, self._published_age_s)
+            changed, error_max = self._updates.mirror_changed, self._values["calibrated_error_max"]
+            temperature, age_s = self._temperatures.published(), self._published_age_s
+            put_updates(message, kept, temperature, self._doubts(), changed, error_max, age_s)
 
     @property
     def recipes_in_doubt(self) -> bool:
@@ -121,8 +122,7 @@ class MapListener:
         doubts = [*self._updates.doubts, *self._updates.widened]
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
-        kept = self._updates.in_use
-        if kept is not None and (error := kept.filter.warm_error(kept.drift, self._temperatures.now())):
+        if (kept := self._updates.in_use) and (error := kept.filter.warm_error(kept.drift, self._temperatures.now())):
             doubts.append(
                 f"No message on the topic temperature: up to {1e9 * error:.1f} nm of thermal drift are not corrected."
             )

@@ -17,7 +17,11 @@ SCHEMA_VERSION = 1
 
 #: Arrays of finite numbers, and arrays in which NaN has the given meaning.
 _ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
-_OR_NAN = {"stuck": "an actuator moves", "temperatures": "it is not known"}
+_OR_NAN = {
+    "stuck": "an actuator moves",
+    "failing": "an actuator follows its commands",
+    "temperatures": "it is not known",
+}
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Names of the evidence, missing in older files, with values that give a trust of exactly 1, with which those updates
 #: were used; and figures missing in older files, with what they were then.
@@ -84,7 +88,7 @@ def read_updates(path: Path, calibration: Calibration, like: Drift) -> Drift | N
     if later and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
         size = len(like.covariance) - sum(map(len, later.values()))
         arrays |= later | {"covariance": block_diag(covariance, like.covariance[size:, size:])}
-    # Older files lack these: then all actuators moved, and the temperature was not known.
+    # Older files lack these: then all actuators moved and followed, and the temperature was not known.
     arrays |= {name: columns.get(name, getattr(like, name)) for name in _OR_NAN}
     for name, value in arrays.items():
         shape, nan = getattr(like, name).shape, name in _OR_NAN

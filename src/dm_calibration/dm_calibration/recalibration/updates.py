@@ -20,8 +20,10 @@ from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import (
     described,
+    failing_from,
     noticed,
     noticed_error,
+    shown_at,
     without_response,
     worst_other_error,
 )
@@ -29,7 +31,7 @@ from dm_calibration.recalibration.drift import Comparison, Drift, UpdateOptions
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, read_updates, write_updates
 from dm_common.atomic_write import storing
-from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
+from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal, beside
 from dm_common.measurement import Measurement
 
 #: Time within which all maps of a mirror that has not moved share the error of the hysteresis model, s.
@@ -123,8 +125,8 @@ class RecalibrationManager:
             )
         if not drift.surprising and drift.disagreement:
             sentences.append(
-                "The last map shows an actuator that may begin to fail, or moves again: bounds are wider until one "
-                "does not."
+                "A map shows an actuator that may begin to fail, or moves again: bounds are wider until one in which "
+                "it would show does not."
             )
         if 0 < drift.surprising < self._options().surprises_max:
             last = "map disagrees" if drift.surprising == 1 else f"{drift.surprising} maps disagree"
@@ -199,20 +201,29 @@ class RecalibrationManager:
                 return Verdict(accepted, reason, comparison)
             if accepted:
                 begins = noticed_error(comparison.displaced, calibration.fit.influence_zernike)
-                changed = replace(comparison.updated, disagreement=begins)
+                shown = shown_at(settled.effective, updates)
+                failing = failing_from(*found, updates, shown)
+                if np.isfinite(updates.failing[~shown]).any():  # this map could not show what earlier ones did
+                    begins = max(begins, updates.disagreement)
+                changed = replace(comparison.updated, disagreement=begins, failing=failing)
                 kept = replace(kept, repeats=repeat + 1)
                 if not repeat:
                     kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
             else:
                 other_error = worst_other_error(*found, calibration.fit.influence_zernike)
                 worst = max(kept.drift.disagreement, comparison.max_zernike, other_error)
-                changed = replace(kept.drift, surprising=kept.drift.surprising + 1, disagreement=worst)
+                failing = failing_from(*found, kept.drift, np.zeros(len(kept.drift.stuck), dtype=np.bool_))
+                surprising = kept.drift.surprising + 1
+                changed = replace(kept.drift, surprising=surprising, disagreement=worst, failing=failing)
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration, changed)
             self.in_use, self.ignored = replace(kept, drift=changed), ""
+            gain, actuator = changed.largest_gain
+            departure = comparison.max_zernike, comparison.rms, comparison.surprise
+            seconds = 1e-9 * measured.stamp_ns
+            check = Check(seconds, int(accepted), *departure, gain, actuator + 1, changed.offset_rms)
             with suppress(OSError):  # the update itself is stored
-                shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
-                append_check(self._file(calibration.id, LOG_SUFFIX), shown)
+                append_check(self._file(calibration.id, LOG_SUFFIX), check)
             if not accepted and self.mirror_changed:
                 reason = (
                     f"{reason}; {changed.surprising} maps in a row disagree: the mirror has changed: calibrate again"
@@ -279,7 +290,7 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
     seen, least = float(np.isfinite(measured.sag) @ calibration.fit.points.weight), options.valid_fraction_min
     for share, text in ((measured.valid_fraction, "the pixels are valid"), (seen, "the sampled area has data")):
         if not share >= least:
-            raise MapNotUsableError(f"{share:.1%} of {text}: must be at least {least:.1%}")
+            raise MapNotUsableError(f"{beside('.1%', share, least)} of {text}: must be at least {least:.1%}")
     if measured.stamp_ns <= calibration.stamp_ns:
         early = 1e-9 * (calibration.stamp_ns - measured.stamp_ns)
         raise MapNotUsableError(f"stamp {early:.3f} s before the calibration was finished: must be after that")

@@ -228,8 +228,6 @@ def _samples(
 
 
 def _check_collinear(x: Floats, names: Sequence[str]) -> None:
-    if not x.shape[1]:
-        return
     centred = x - x.mean(axis=0)
     size = np.linalg.norm(centred, axis=0)
     constant = np.flatnonzero(size <= CONSTANT * np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny))

@@ -1,5 +1,6 @@
 """Text of the report, part one: key figures, provenance, warnings and limitations, all maps, files."""
 
+import itertools
 import time
 from collections import Counter
 from pathlib import PurePath
@@ -9,7 +10,7 @@ import numpy as np
 from dm_calibration.calibration import POKE_CHECK, Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report.document import Section, Table
-from dm_common.figures import with_wavelengths
+from dm_common.figures import counted, with_wavelengths
 
 NM = 1e9
 #: Number of hexadecimal digits of a file's SHA-256 shown in the table of maps.
@@ -26,11 +27,6 @@ def length(metres: float, wavelength: float) -> str:
     if not np.isfinite(metres):
         return "not known"
     return with_wavelengths(f"{metres * NM:.2f} nm", metres, wavelength)
-
-
-def _counted(number: int, one: str, many: str) -> str:
-    """A number with its noun in the singular or plural."""
-    return f"{number or 'No'} {one if number <= 1 else many}"
 
 
 def summary(calibration: Calibration) -> Section:
@@ -66,16 +62,18 @@ def summary(calibration: Calibration) -> Section:
             "effective signals, which follow from the history of all moves since the last degauss."
         )
     dropped, warnings = calibration.maps_dropped, len(calibration.limitations)
-    counted = (
-        f"{_counted(dropped, 'map was', 'maps were')} dropped; "
-        f"{_counted(warnings, 'warning or limitation', 'warnings and limitations')} below."
+    counts = (
+        f"{counted(dropped, 'map was', 'maps were')} dropped; "
+        f"{counted(warnings, 'warning or limitation', 'warnings and limitations')} below."
     )
     meaning = (
         "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that had "
         "no part in it: the figure to rely on. Re-measured is what a map showed after a command of this calibration "
         "was applied. All lengths are surface sag, piston and tilt removed."
     )
-    return Section("Summary", [kind, meaning, counted], [Table("Key figures", ("figure", "value"), rows)])
+    return Section(
+        "Summary", [kind, meaning, counts[0].upper() + counts[1:]], [Table("Key figures", ("figure", "value"), rows)]
+    )
 
 
 def provenance(calibration: Calibration) -> Section:
@@ -83,7 +81,7 @@ def provenance(calibration: Calibration) -> Section:
     maps, fit = calibration.maps, calibration.fit
     first, last = int(maps.stamp_ns.min()), int(maps.stamp_ns.max())
     wavelength = f"{calibration.wavelength * NM:.2f} nm" if calibration.wavelength > 0.0 else "not stated by the maps"
-    kinds = Counter(maps.kind)
+    kinds = Counter(itertools.compress(maps.kind, maps.has_map))
     rows = [
         ("calibration", calibration.id),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
@@ -94,7 +92,7 @@ def provenance(calibration: Calibration) -> Section:
         ("first map", utc(first)),
         ("last map", f"{utc(last)}, {(last - first) / 60e9:.1f} min later"),
         ("maps", ", ".join(f"{count} {kind}" for kind, count in kinds.items())),
-        ("maps in the fit", f"{int(fit.used.sum())} of {len(maps)}"),
+        ("maps in the fit", f"{int(fit.used.sum())} of {maps.has_map.sum()}"),
         ("method", fit.method),
         ("fitted", f"{maps.terms} Zernike coefficients (Born & Wolf) and sag at {maps.points.x.size} points"),
         ("software", f"dm_calibration {calibration.software_version}"),
@@ -119,8 +117,7 @@ def cautions(calibration: Calibration) -> Section:
     checked = [f"Poke check. {finding}" for finding in findings]
     if not findings:
         checked = ["Poke check: the responses lie where the configured layout puts the actuators."]
-    fit, maps = calibration.fit, calibration.maps
-    rejected = [(maps.label[i], fit.reasons[i]) for i in np.flatnonzero(~fit.used)]
+    rejected = calibration.maps.rejected(calibration.fit.reasons)
     never = [(label, reason.strip()) for label, _, reason in (entry.partition(":") for entry in calibration.dropped)]
     table = Table("Maps that are not in the fit", ("map", "reason"), [*rejected, *never], textual=True)
     return Section("Warnings and known limitations", [*checked, *others], [table] if table.rows else [])
@@ -136,7 +133,7 @@ def every_map(calibration: Calibration) -> Section:
             maps.kind[i],
             f"{seconds[i]:.1f}",
             f"{fit.map_residual[i] * NM:.2f}" if fit.used[i] else "dropped",
-            f"{maps.residual_rms[i] * NM:.2f}",
+            f"{maps.residual_rms[i] * NM:.2f}" if np.isfinite(maps.residual_rms[i]) else "no map",
             f"{100 * maps.valid_fraction[i]:.1f}",
         )
         for i, label in enumerate(maps.label)

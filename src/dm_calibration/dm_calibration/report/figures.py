@@ -8,7 +8,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
-from scipy.interpolate import RBFInterpolator
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import StepKind
@@ -16,7 +15,7 @@ from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
 from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, YELLOW
 from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
-from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.sampling import on_disc
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 
 NM, MM = 1e9, 1e3
@@ -33,24 +32,10 @@ KIND_COLOURS: dict[str, str] = dict(
 )
 
 
-def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:
-    """Interpolate `values` (Q, P) at the points onto square maps (Q, pixels, pixels), NaN outside the unit disc.
-
-    Thin-plate splines through all points; row 0 = bottom.
-    """
-    axis = np.linspace(-1.0, 1.0, pixels)
-    x, y = np.meshgrid(axis, axis)
-    inside = np.hypot(x, y) <= 1.0
-    spline = RBFInterpolator(np.column_stack((points.x, points.y)), values.T, kernel="thin_plate_spline")
-    maps = np.full((len(values), pixels, pixels), np.nan)
-    maps[:, inside] = spline(np.column_stack((x[inside], y[inside]))).T
-    return maps
-
-
 def influence_sheet(calibration: Calibration) -> Figure:
     """One small map per actuator, all on one scale, with its grade."""
     fit = calibration.fit
-    maps = on_disc(fit.influence_sag.T, fit.points) * NM
+    maps = on_disc(fit.influence_sag.T, fit.points, PIXELS) * NM
     radius = calibration.aperture_radius * MM
     rows = -(-len(maps) // COLUMNS)
     # All maps in one pair of axes: axes for each map would take ten times as long as all the rest.

@@ -65,9 +65,8 @@ class CalibrationStore:
             ValueError: the id is not a safe file stem.
         """
         if not _ID.fullmatch(calibration.id):
-            raise ValueError(
-                f"calibration id {calibration.id!r}: letters, digits, '.', '_', '-', at most 128, no leading dot"
-            )
+            allowed = "must be 1 to 128 letters, digits, '.', '_' or '-', with no leading dot"
+            raise ValueError(f"calibration id = {calibration.id!r}: {allowed}")
         target = self._file(calibration.id)
         if target.exists():
             raise StoreError(f"calibration {calibration.id} exists already; it is not overwritten")
