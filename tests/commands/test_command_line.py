@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -98,6 +100,7 @@ def test_a_negative_curvature_is_a_number(words: tuple[str, ...]) -> None:
         ("focus", ("0,03",), {"curvature": 0.03}),
         ("focus", ("-0,02", "--conic", "-0,5"), {"curvature": -0.02, "conic": -0.5}),
         ("focus", ("--conic=−,5", "--", "−1e-2"), {"curvature": -0.01, "conic": -0.5}),
+        ("focus", ("0,03", "--conditioned"), {"curvature": 0.03, "conditioned": True}),
         ("measure", ("--reference-sphere", "1,25"), {"reference_sphere": 1.25}),
         ("recipes", ("--curvatures", "0,03", "--conic", "0,5"), {"curvatures": "0,03", "conic": 0.5}),
         ("report", ("--operator", "1,5"), {"operator": "1,5"}),
@@ -149,9 +152,10 @@ def test_the_version_is_said() -> None:
 def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = parsed("status", "--json", "-")["json"]
     output.console.print("for a person")
-    write_json(path, {"length": float("nan")})
+    write_json(path, {"length": math.nan, "ends": (-math.inf, 0.1), "rows": [{"rms": math.inf}]})
     said = capsys.readouterr()
-    assert json.loads(said.out) == {"length": None} and said.err == "for a person\n"
+    assert json.loads(said.out) == {"length": None, "ends": [None, 0.1], "rows": [{"rms": None}]}
+    assert said.err == "for a person\n"
     assert parsed("status", "--json", str(tmp_path / "f"))["json"] == tmp_path / "f"
     output.console.print("again")
     assert capsys.readouterr().out == "again\n"
@@ -509,6 +513,18 @@ def test_status_says_where_only_of_what_is_absolute() -> None:
     assert verb_status._absolute(able, used).endswith(", limited by the lateral scale, at -0.0500 1/m")
 
 
+def test_a_node_that_was_not_heard_does_not_count_as_well() -> None:
+    well = SimpleNamespace(level=b"\0", message="ready")
+    doubtful = SimpleNamespace(level=b"\1", message="calibrate again")
+    health = dict.fromkeys(("pdm_driver", "interferometer", "focus_controller"), well)
+    found = Counter((*health, "calibration"))
+    silent = verb_status._silent(found, health)
+    assert verb_status._health(health, silent) == "calibration: not heard"
+    assert not verb_status._silent(Counter(health), health), "a node that does not run is in another row"
+    assert verb_status._health(health, []) == "ok"
+    assert verb_status._health(health | {"calibration": doubtful}, []) == "calibration: calibrate again"
+
+
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
     said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))
@@ -538,6 +554,8 @@ def test_of_another_bench_the_wiring_comes_first() -> None:
     check = parsed("calibrate", *shlex.split(first_command(none, file))[1:])
     assert check["plan"] == "poke-check" and check["config"] == file and check["write"] is not None
     assert first_command(able, file) == "focus 0.02" and first_command(none, None) == "calibrate"
+    again = parsed("calibrate", *shlex.split(first_command(none, Path("found.yaml")))[1:])
+    assert again["config"] == Path("found.yaml") != again["write"]  # nothing is written over the file that is read
     # As ./dm status has it then.
     able.message = f"-0.05 to +0.05 1/m; {HISTORY_UNKNOWN}restarted"
     assert first_command(able, file) == "degauss"
@@ -547,8 +565,20 @@ def test_of_another_bench_the_wiring_comes_first() -> None:
     active = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE)
     assert first_command(refused, file) == "calibrate"
     assert verb_status._next([], "", active, used, None, refused) == "./dm calibrate"
+    assert verb_status._next([], "", active, None, None, none).startswith("./dm calibrate --plan poke-check --config ")
+    assert verb_status._next([], "", active, None, None, none, simulated=True) == "./dm calibrate"
     lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST)
     assert "must reach the electronics first" in verb_status._next([], "", lost, used, None, refused)
+
+
+@pytest.mark.parametrize(("predicted", "next_step"), [(19e-9, "./dm check"), (21e-9, "ask for the shape again: ")])
+def test_a_shape_of_before_the_calibration_changed_is_asked_for_again(predicted: float, next_step: str) -> None:
+    """As ./dm check has it after --without: a map would show the error that the present command makes."""
+    active, used = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE), Calibration(id="c1")
+    used.hysteresis.play_radius = [0.0]
+    able = Capabilities(calibration_id="c1", residual_tolerance=20e-9)
+    shape = SettledShape(0.02, 60.0, 30e-9, True, predicted, False)
+    assert verb_status._next([], "", active, used, shape, able).startswith(next_step)
 
 
 @pytest.mark.parametrize(

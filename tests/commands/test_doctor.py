@@ -194,6 +194,7 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("virtual_bench", LINK | {"framed.scale": 0}, "framed.scale = 0"),
     ("virtual_bench", {"mirror.principle": "membrane", "membrane.pitch": 0.01}, "membrane"),
     ("virtual_bench", {"mirror.principle": "membrane", "membrane.tension": 1.0}, "membrane.tension = 1 N/m"),
+    ("virtual_bench", {"volts.min": -200.0}, "volts.min = -200 V: must be 0 to 400 V"),
     ("virtual_bench", {"electronics.amplifier_min": 500.0}, "electronics.amplifier_min = 500 V"),
     ("virtual_bench", {"piezo.creep_fastest": 10.0, "piezo.creep_slowest": 5.0}, "piezo.creep_slowest, 5 s"),
     ("virtual_bench", LINK | {"framed.channels": 41}, "framed.channels = 41"),
@@ -285,8 +286,8 @@ def test_a_port_in_use_is_named() -> None:
         port = holder.getsockname()[1]
         driver = {"electronics.address": "127.0.0.1", "electronics.port": port, "mirror.actuators": 37}
         assert electronics.opens("edac40_tcp", driver) is None
-        finding = doctor_bench.taken_ports(GOOD["virtual_bench"] | {"trigger.port": port})
-        wrong = doctor_bench.taken_ports({"trigger.port": port, "electronics.tcp_port": str(port)})
+        finding = doctor_bench.taken_ports({"virtual_bench": GOOD["virtual_bench"] | {"trigger.port": port}})
+        wrong = doctor_bench.taken_ports({"virtual_bench": {"trigger.port": port, "electronics.tcp_port": str(port)}})
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
     assert wrong is not None and "electronics.tcp_port" not in wrong.problem  # which the node refuses
     finding = electronics.opens("edac40_tcp", driver)
@@ -318,6 +319,10 @@ def test_a_place_that_may_not_be_searched_is_a_finding_too(monkeypatch: pytest.M
     assert "cure: start the nodes with ROS 2 from apt, or unset ROS_SECURITY_ENABLE" in said.get()
     assert "WRONG watch_folder: cannot be checked:" in said.get() and "/home/other/security/maps" in said.get()
     assert "cure: give this user the right to it" in said.get() and "none" in said.get()
+    monkeypatch.setattr(doctor_bench, "bench_checks", lambda _config, _namespace: [])
+    with output.console.capture() as said, pytest.raises(typer.Exit):
+        doctor_verb.doctor(Path("my bench.yaml"))
+    assert "then ./dm doctor --config 'my bench.yaml' again" in said.get()
 
 
 def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:

@@ -17,6 +17,17 @@ from support import CommonLawsSuite, Observer, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 
+#: What of state and progress is not wholly seen; the row of badges begins with what is wrong, and its end may be.
+CLIPPED = """
+const header = document.querySelector('.header').getBoundingClientRect();
+const inside = (at, row) => at.top >= Math.max(header.top, row.top) && at.left >= row.left &&
+  at.bottom <= Math.min(header.bottom, row.bottom) && at.right <= row.right;
+const badges = [...document.querySelectorAll('.header .badge')].sort((a, b) => a.offsetLeft - b.offsetLeft);
+const rest = document.querySelectorAll('.header .now, .header .work .text, .header .work button');
+return [badges[0], ...rest].filter((at) => at.checkVisibility() && !inside(
+  at.getBoundingClientRect(), at.parentElement.closest('.line').getBoundingClientRect())).map((at) => at.innerText);
+"""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -162,9 +173,12 @@ def test_a_calibration_started_elsewhere_is_shown_and_can_be_cancelled(page: Bro
         wait_until(lambda: "maps" in " ".join(page.pictures("residual of ")), 60, "its residuals")
         assert not page.find("Move", "button").is_enabled()
         page.resize(*PHONE)
+        page.wait_for("calibration holds the mirror", 30)
+        page.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", page.find("Poke", "button"))
         assert page.driver.execute_script(
             "const header = document.querySelector('.header'); return header.scrollHeight <= header.clientHeight"
         ), "the header holds what it shows"
+        assert page.driver.execute_script(CLIPPED) == [], "state and progress are in sight"
         page.resize(*DESKTOP)
         page.press("Cancel calibration")
         wait_until(result.done, 60, "its end")

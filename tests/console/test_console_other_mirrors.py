@@ -57,6 +57,22 @@ while (texts.nextNode()) {
 }
 return [seen, poor];
 """
+#: Number of cells of the command map that are drawn before the outline of the chosen one.
+OUTLINED = """
+const cells = [...document.querySelectorAll('[aria-label^="command map"] svg path[stroke-linejoin=round]')];
+return cells.findIndex((cell) => cell.getAttribute('stroke-width') === '4');
+"""
+#: Heights of controls of each kind, in folded cards and others; what of an unfolded card is wider than its card, or
+#: touches what is above it.
+LAID_OUT = """
+const box = (at) => at.getBoundingClientRect();
+const shown = (path) => [...document.querySelectorAll(path)].filter((at) => at.checkVisibility());
+const height = (kind) => [...new Set(shown(`.card ${kind}`).map((at) => Math.round(box(at).height)))];
+const beyond = shown('.unfolded *').filter((at) => box(at).right > box(at.closest('.card')).right);
+const near = shown('.unfolded > * + *').filter((at) => box(at).top < box(at.previousElementSibling).bottom + 4);
+return [Object.fromEntries(['.q-btn', '.q-toggle__inner'].map((kind) => [kind, height(kind)])),
+  [...beyond, ...near].map((at) => at.outerHTML)];
+"""
 #: What has the focus: its name or words, and where it is.
 FOCUSED = """
 const at = document.activeElement, box = at.getBoundingClientRect();
@@ -142,6 +158,14 @@ def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, Stan
     wait_until(lambda: stand_in.signals == [0.0] * 19, 60, "the release")
 
 
+def test_nothing_covers_the_outline_of_the_actuator_that_is_chosen_next(bench: tuple[Browser, StandIn]) -> None:
+    page = bench[0]
+    for number in ("5", "1"):
+        page.enter("Number", number)
+        page.wait_for(f"Actuator {number}, signal")
+        wait_until(lambda: page.driver.execute_script(OUTLINED) == 18, 20, "it in front of the 18 others")
+
+
 def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn]) -> None:
     page = bench[0]
     page.wait_for("Predicted residual")
@@ -169,7 +193,7 @@ def test_every_control_has_a_name(bench: tuple[Browser, StandIn]) -> None:
     for title in DETAILS:
         bench[0].unfold(title)
     rows = named_nodes(bench[0])
-    assert {"button", "spinbutton", "slider", "radio", "switch", "combobox"} <= {role for role, _name in rows}
+    assert {"button", "textbox", "slider", "radio", "switch", "combobox"} <= {role for role, _name in rows}
     assert [role for role, name in rows if not name.strip()] == []
 
 
@@ -194,13 +218,13 @@ def test_all_text_stands_out_from_its_ground(
     page.prefer(scheme)
     for title in DETAILS:
         page.unfold(title)
-    page.enter("Recipes", "0")
+    page.enter("Recipes", "1e9")
     page.wait_for("Predicted residual")
     move = page.find("Move", "button")
     wait_until(lambda: page.stands_still(move), 60, "button Move to stand still")  # what unfolds takes a moment
     before = move.rect
     page.press("Build recipes")
-    wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 60, "a refusal")
+    wait_until(lambda: "recipes = 1e9: must be a whole number, 1 to 1000" in page.alerts(), 60, "a refusal")
     assert page.find("Move", "button").rect == before, "a message moves nothing"
     assert page.driver.execute_script("return document.querySelector('.header').getBoundingClientRect().height") <= 120
     seen, poor = page.driver.execute_script(LOW_CONTRAST)
@@ -212,6 +236,20 @@ def test_all_text_stands_out_from_its_ground(
     page.dismiss_all()
     page.prefer("light")
     page.resize(*DESKTOP)
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_what_was_folded_is_laid_out_as_other_cards_are(bench: tuple[Browser, StandIn], size: tuple[int, int]) -> None:
+    page = bench[0]
+    page.resize(*size)
+    for title in DETAILS:
+        summary = page.find(title, "details").find_element(By.TAG_NAME, "summary")
+        assert summary.value_of_css_property("display") == "list-item", "a triangle says that there is more"
+        page.unfold(title)
+    heights, beyond = page.driver.execute_script(LAID_OUT)
+    page.resize(*DESKTOP)
+    assert {kind: len(found) for kind, found in heights.items()} == {".q-btn": 1, ".q-toggle__inner": 1}
+    assert beyond == []
 
 
 @needs_axe

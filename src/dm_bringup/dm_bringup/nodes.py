@@ -117,7 +117,7 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         ValueError: an invalid value; the message names the argument, the value and what is allowed.
     """
     if (level := values["log_level"].rpartition(":=")[2].lower()) not in LOG_LEVELS:  # may be that of one logger
-        raise ValueError(f"log_level = {level!r}: must be {', '.join(LOG_LEVELS)}")
+        raise ValueError(f"log_level = {level!r}: must be one of {', '.join(LOG_LEVELS)}")
     switches = {}
     if values["use_sim_time"]:
         switches["use_sim_time"] = flag("use_sim_time", values["use_sim_time"])

@@ -157,7 +157,7 @@ def test_what_a_fleet_sets_reaches_every_node() -> None:
         "respawn_delay": "must be a number",
         "autostart": "must be true, events or false",
         "remap": "must be of",
-        "log_level": "must be debug, info",
+        "log_level": "must be one of debug, info",
     }
     for name, text in wrong.items():
         with pytest.raises(ValueError, match=f"{name}.*{text}"):

@@ -11,7 +11,7 @@ with DeformableMirrorClient() as mirror:
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Self, TypedDict, Unpack
+from typing import Any, Self, Unpack
 
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
@@ -29,7 +29,7 @@ from dm_msgs.srv import (
 from sensor_msgs.msg import Image
 
 from dm_client.connection import RESTING, Connection, DeformableMirrorError, Watched
-from dm_client.fields import filled
+from dm_client.fields import Claim, FocusOptions, filled
 from dm_common.errors import ErrorCode
 from dm_common.messages import driver_refusal
 from dm_common.ros import qos
@@ -75,18 +75,6 @@ WATCHED: Watched = {
 INTERFACES = {name: interface for *_, served in WATCHED.values() for name, interface in served.items()}
 #: `timeout_s` for nodes that the same program has only just started, s.
 STARTING_S = 60.0
-
-
-class Claim(TypedDict, total=False):
-    """Options of every request that moves or holds the mirror, if somebody holds it (service `hold_mirror`).
-
-    Attributes:
-        holder: name of the client; requests of the client that holds the mirror are carried out.
-        take_over: carry it out even if somebody else holds the mirror: they lose it, and their run ends.
-    """
-
-    holder: str
-    take_over: bool
 
 
 class DeformableMirrorClient(Connection):
@@ -161,15 +149,15 @@ class DeformableMirrorClient(Connection):
         zernike: Sequence[float] = (),
         *,
         dry_run: bool = False,
-        **claim: Unpack[Claim],
+        **options: Unpack[FocusOptions],
     ) -> FocusState:
         """Set the surface curvature [1/m] (concave positive) and return the prediction; `dry_run` moves nothing."""
-        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, zernike=zernike, **claim)
+        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, zernike=zernike, **options)
         return self.call("set_focus", filled(SetFocus.Request, request=request, dry_run=dry_run)).state
 
-    def focus_power(self, power: float, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
+    def focus_power(self, power: float, *, dry_run: bool = False, **options: Unpack[FocusOptions]) -> FocusState:
         """Set the optical power [dioptre] = 2 x surface curvature."""
-        return self.focus(filled(FocusState, power=power).power / 2.0, dry_run=dry_run, **claim)
+        return self.focus(filled(FocusState, power=power).power / 2.0, dry_run=dry_run, **options)
 
     def flatten(self, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Make the surface as flat as the mirror can."""
@@ -249,10 +237,10 @@ class DeformableMirrorClient(Connection):
         settle_time: float = 0.0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = math.inf,
-        **claim: Unpack[Claim],
+        **options: Unpack[FocusOptions],
     ) -> MoveFocus.Result:
         """Move to a curvature and return once the shape has settled."""
-        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **claim)
+        request = filled(FocusRequest, curvature=curvature, conic_constant=conic_constant, **options)
         goal = filled(MoveFocus.Goal, request=request, tolerance=tolerance, settle_time=settle_time)
         return self.run_action("move_focus", goal, on_feedback, timeout_s)
 

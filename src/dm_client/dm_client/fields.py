@@ -1,12 +1,36 @@
-"""Conversion of Python values to fields of messages: NumPy scalars, paths, lists of either."""
+"""Fields that requests share, and conversion of Python values to fields: NumPy scalars, paths, lists of either."""
 
 import operator
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict
 
 from dm_client.connection import DeformableMirrorError
-from dm_common.errors import ErrorCode
+from dm_common.errors import ErrorCode, unknown_name
+
+
+class Claim(TypedDict, total=False):
+    """Options of every request that moves or holds the mirror, if somebody holds it (service `hold_mirror`).
+
+    Attributes:
+        holder: name of the client; requests of the client that holds the mirror are carried out.
+        take_over: carry it out even if somebody else holds the mirror: they lose it, and their run ends.
+    """
+
+    holder: str
+    take_over: bool
+
+
+class FocusOptions(Claim, total=False):
+    """Options of a request for a shape.
+
+    Attributes:
+        mode: "auto", "direct" or "conditioned", as in FocusRequest.
+        time_budget: s within which the shape must be reached; 0 = as configured in the controller.
+    """
+
+    mode: str
+    time_budget: float
 
 
 def _text(value: Any) -> str:
@@ -44,7 +68,8 @@ def filled(kind: Any, **values: Any) -> Any:
     """
     types = kind.get_fields_and_field_types()
     if unknown := values.keys() - types.keys():
-        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, f"{', '.join(sorted(unknown))}: no such field")
+        text = "; ".join(str(unknown_name("field", name, types)) for name in sorted(unknown))
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, text)
     return kind(**{name: _field(name, value, types[name]) for name, value in values.items()})
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dm_msgs.action import BuildRecipes, Degauss
-from dm_msgs.msg import MirrorInfo
+from dm_msgs.msg import FocusRequest, MirrorInfo
 from dm_msgs.srv import IngestFile, Measure, SetFocus, SetSignals, UpdateCalibration
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError
@@ -44,7 +44,8 @@ def test_what_means_the_same_is_taken() -> None:
         (SetSignals.Request, {"signals": "123"}, ErrorCode.INVALID_ARGUMENT, "signals = '123': must be sequence"),
         (SetSignals.Request, {"take_over": "no"}, ErrorCode.INVALID_ARGUMENT, "take_over = 'no': must be true or"),
         (SetSignals.Request, {"wait": 2}, ErrorCode.INVALID_ARGUMENT, "wait = 2: must be true or false"),
-        (SetSignals.Request, {"holdr": "me"}, ErrorCode.INVALID_ARGUMENT, "holdr: no such field"),
+        (SetSignals.Request, {"holdr": "me"}, ErrorCode.INVALID_ARGUMENT, "field 'holdr' is unknown; did you mean"),
+        (SetSignals.Request, {"z": 1, "holdr": ""}, ErrorCode.INVALID_ARGUMENT, "field 'holdr'.*field 'z' is unknown"),
     ],
 )
 def test_what_is_no_such_thing_is_refused_by_name(kind: Any, fields: dict[str, Any], code: int, text: str) -> None:
@@ -59,6 +60,17 @@ def test_the_interferometer_keeps_the_time_of_a_measurement(monkeypatch: pytest.
     DeformableMirrorClient.__new__(DeformableMirrorClient).measure("night", timeout_s=7)
     ((name, request, waits),) = calls
     assert (name, request.timeout) == ("measure", 7.0) and waits > 7.0, "its answer says why"
+
+
+def test_a_shape_may_be_asked_for_by_the_recipes(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[Any] = []
+    for way in ("call", "run_action"):
+        monkeypatch.setattr(DeformableMirrorClient, way, lambda _self, *arguments: sent.append(arguments[1].request))
+    mirror = DeformableMirrorClient.__new__(DeformableMirrorClient)
+    mirror.move_focus(0.02, mode=FocusRequest.MODE_CONDITIONED, holder="me")
+    with pytest.raises(AttributeError):  # nothing answers
+        mirror.focus(0.02, time_budget=np.float32(4.0))
+    assert (sent[0].mode, sent[0].holder, sent[1].mode, sent[1].time_budget) == ("conditioned", "me", "", 4.0)
 
 
 def test_what_takes_as_long_as_the_instrument_takes_is_not_given_up_before_its_node_does(

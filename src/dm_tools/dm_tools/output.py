@@ -1,7 +1,6 @@
 """What the subcommands share: console, figures as JSON, progress bars, and their last lines."""
 
 import json
-import math
 import os
 import re
 import sys
@@ -134,22 +133,12 @@ def progress_bar(steady: bool = True) -> Progress:
     )
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no NaN: unknown numbers become null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
-
-
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     """Write figures whole or not at all, `-` to standard output; None writes nothing."""
     if path is None:
         return
-    text = json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n"
+    known = json.loads(json.dumps(figures), parse_constant=lambda _name: None)  # JSON has no NaN: it becomes null
+    text = json.dumps(known, indent=2) + "\n"
     if path == STANDARD_OUTPUT:
         print(text, end="")
         return

@@ -89,12 +89,11 @@ def promise(bound: float) -> str:
 
 def promise_of(calibration: Any) -> float:
     """95 % bound on the largest coefficient error of a request without creep, m, from a calibration's message."""
-    from dm_common.hysteresis.model import REQUEST_ERROR_RATIO
+    from dm_common.hysteresis.model import request_error
     from dm_common.messages import hysteresis_model_from
 
-    if hysteresis_model_from(calibration.hysteresis) is None:
-        return float(calibration.held_out_max_zernike)
-    return float(REQUEST_ERROR_RATIO * calibration.hysteresis.held_out_max_zernike)
+    without_law = hysteresis_model_from(calibration.hysteresis) is None
+    return request_error(calibration, None if without_law else calibration.hysteresis)
 
 
 def unknown_history(capabilities: Any) -> str:

@@ -26,9 +26,9 @@ from dm_msgs.msg import (
     SurfaceMapInfo,
     ZernikeCoefficients,
 )
-from dm_msgs.srv import Measure, SetSignals
+from dm_msgs.srv import ListCalibrations, Measure, SetSignals
 from matplotlib.image import imread
-from nicegui import Client
+from nicegui import Client, background_tasks
 from nicegui.page import page as nicegui_page
 from sensor_msgs.msg import Image
 
@@ -49,6 +49,8 @@ from dm_tools.console.style import CSS
 from dm_tools.console.surface_view import SurfaceView
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.console.widgets.actuators import ActuatorCards
+from dm_tools.console.widgets.calibration import CalibrationCard, RecipesCard
+from dm_tools.console.widgets.components import DecimalField, WholeNumberField
 from dm_tools.console.widgets.focus import FocusCard
 from dm_tools.running_suite import NEEDED
 from dm_tools.verify import map_of
@@ -114,10 +116,10 @@ def test_the_command_map_has_every_actuator_where_it_is() -> None:
     assert drawing.options["visualMap"]["text"] == ["+1", "signal -0.25"]
     cells, circle = drawing.options["series"]
     assert sorted(number for _x, _y, number in (item["value"] for item in cells["data"])) == list(range(1, COUNT + 1))
-    assert cells["data"][-1]["value"][2] == 3  # drawn last: nothing covers its outline
     embedded = re.search(r"cell = (\[.*\])\[params", cells[":renderItem"])
     assert embedded
     drawn = json.loads(embedded[1])
+    assert [cell["label"] for cell in drawn if cell["z2"]] == ["3"], "nothing covers its outline"
     assert [cell["label"] for cell in drawn] == [str(item["value"][2]) for item in cells["data"]]
     for cell, item in zip(drawn, cells["data"], strict=True):
         assert np.mean(cell["corners"], axis=0) == pytest.approx(item["value"][:2], abs=2e-3)
@@ -216,6 +218,7 @@ def test_badges_warn_of_an_unknown_history() -> None:
     )
     assert ("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
     assert ("history: known", "") in status.badges(snapshot, "")
+    assert ("calibrated: c19", "") in status.badges(snapshot, "")  # a phone shows the beginning only
 
 
 def test_the_worst_diagnostics_come_first() -> None:
@@ -252,6 +255,8 @@ def test_the_page_says_where_the_mirror_stands() -> None:
     snapshot = Snapshot(actuator_state=ActuatorState(), health=heard)
     assert status.now_text(snapshot) == "now: +0.0500 1/m for 40 s, within 1.3 nm (95 %)"
     assert status.now_text(replace(snapshot, actuator_state=ActuatorState(moving=True))) == "now: moving"
+    others = replace(snapshot, actuator_state=ActuatorState(holder="alignment script"))
+    assert status.now_text(others).endswith("(95 %); alignment script holds the mirror")
     silent = replace(snapshot, health=dict.fromkeys(heard, DiagnosticStatus()))
     assert "not at a curvature" in status.now_text(silent)
     assert "not heard" in status.now_text(Snapshot())
@@ -286,7 +291,8 @@ def test_the_nodes_of_another_mirror_are_not_taken_for_those_of_this_one(
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("0,02", 0.02), (" -0.02 ", -0.02), ("−1", -1.0), ("", None), ("1,2,3", None), ("nan", None)]
+    ("text", "value"),
+    [("0,02", 0.02), (" -0.02 ", -0.02), ("−1", -1.0), ("", None), ("1,2,3", None), ("nan", None), ("1_0", None)],
 )
 def test_numbers_are_taken_as_people_write_them(text: str, value: float | None) -> None:
     assert view_models.decimal(text) == value
@@ -307,6 +313,8 @@ def test_a_poke_turns_back_where_the_range_ends() -> None:
         view_models.poke_signals([0.0, 0.0], 3, 0.3, -1.0, 1.0)
     with pytest.raises(ValueError, match=r"amplitude = 30: from \+0\.000 both ways leave the range -1 to \+1"):
         view_models.poke_signals([0.0, 0.0], 2, 30.0, -1.0, 1.0)
+    with pytest.raises(ValueError, match="amplitude = 0: must not be 0"):
+        view_models.poke_signals([0.0, 0.0], 2, 0.0, -1.0, 1.0)
 
 
 def test_the_loop_opens_as_the_law_says() -> None:
@@ -440,21 +448,25 @@ def test_a_poke_moves_the_actuator_in_the_field_of_its_page() -> None:
     here, there = ActuatorCards(session), ActuatorCards(session)
     for cards in (here, there):
         cards.refresh(bench())
-    here._number.set_value(5)
+    here._number.set_value("5")
     there._poke()  # its field says 1 until it is refreshed
     here._start_loop()
     there.refresh(bench())
-    assert there._number.value == 5
+    assert there._number.value == "5"
     there._poke()
     assert begun == ["Poke 1", "Loop of actuator 5", "Poke 5"]
-    here._number.set_value(9)
+    here._number.set_value("9")
     here._poke()
-    here._number.set_value(None)
+    here._number.set_value("")
     here._start_loop()
+    here._number.set_value("5")
+    here._amplitude.set_value("far")
+    here._poke()
     assert len(begun) == 3
     assert [failure.sentence for failure in session.failures] == [
         "number = 9: must be a whole number, 1 to 7",
         "number: must be a whole number, 1 to 7",
+        "amplitude = far: must be a number",
     ]
 
 
@@ -486,9 +498,43 @@ def test_a_prediction_goes_with_its_inputs() -> None:
     focus._prediction.show("Predicted residual 5.0 nm rms")
     focus.refresh(bench())
     assert focus._prediction.text
+    for text in ("up", "down"):
+        focus._number.set_value(text)
+        focus.refresh(bench())
+        assert not focus._prediction.text
+        focus._predicted = focus._inputs[:3]
+        focus._prediction.show(f"curvature = {text}: must be a number")
     focus._number.set_number(-0.04)
     focus.refresh(replace(bench(), health={}))
-    assert not focus._prediction.text
+    assert focus._prediction.text == "No prediction. The node pdm_driver is not heard."
+
+
+@pytest.mark.usefixtures("page")
+def test_without_a_calibration_there_is_no_prediction_but_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, _ = session_of(StateObserver())
+    focus = FocusCard(session)
+    focus._number.set_number(0.03)
+    focus._predicting = True  # nothing is asked of nodes
+    focus.refresh(bench())
+    focus._prediction.show("Predicted residual 5.0 nm rms")  # of a request that was answered late
+    focus.refresh(replace(bench(), capabilities=Capabilities()))
+    assert focus._prediction.text == ("No prediction. The mirror is not calibrated: run a calibration or load one.")
+    focus.refresh(bench())
+    assert focus._prediction.text == ""
+    focus._predicting, asked = False, []
+    monkeypatch.setattr(background_tasks, "create", lambda request: asked.append(request.close()))
+    focus.refresh(bench())
+    assert len(asked) == 1, "it is asked for again"
+
+
+@pytest.mark.usefixtures("page")
+def test_the_slider_goes_where_the_field_says_once_the_range_is_known() -> None:
+    focus = FocusCard(session_of(StateObserver())[0])
+    focus._predicting = True  # nothing is asked of nodes
+    focus._number.set_number(0.03)
+    able = Capabilities(calibration_id="c19", curvature_min=-0.05, curvature_max=0.05)
+    focus.refresh(replace(bench(), capabilities=able))
+    assert focus._slider.value == 0.03
 
 
 def test_nothing_is_subtracted_from_a_map_of_another_aperture() -> None:
@@ -590,17 +636,69 @@ def test_recipes_are_spread_evenly() -> None:
     assert view_models.evenly(0.01, 0.05, 1) == [0.01]
 
 
+def test_recipes_that_would_all_be_the_same_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"first = last = 0\.02 1/m: must differ"):
+        view_models.evenly(0.02, 0.02, 3)
+
+
+@pytest.mark.parametrize("text", ["2.5", "0", "-3", "1001", "1e9", "many", "nan", "inf"])
+@pytest.mark.usefixtures("page")
+def test_a_whole_number_out_of_its_range_stays_as_typed_and_is_refused(text: str) -> None:
+    field = WholeNumberField("Recipes", 11, range(1, 1001))
+    field.set_value(text)
+    with pytest.raises(ValueError, match=rf"^recipes = {re.escape(text)}: must be a whole number, 1 to 1000$"):
+        field.valid_number  # noqa: B018
+    assert (field.value, field.error) == (text, "whole, 1 to 1000")
+
+
+@pytest.mark.usefixtures("page")
+def test_a_field_that_holds_no_number_is_named() -> None:
+    curvature = DecimalField("Curvature, 1/m", 0.0)
+    for text, words in (("", "curvature: must be a number"), ("up", "curvature = up: must be a number")):
+        curvature.set_value(text)
+        with pytest.raises(ValueError, match=f"^{words}$"):
+            curvature.valid_number  # noqa: B018
+    length = WholeNumberField("Length: commands of the plan", None, range(60, 2001))
+    length.set_value("300")
+    assert (length.valid_number, length.error) == (300, None)
+    length.set_value(" ")
+    assert length.error is None, "as configured"
+
+
+@pytest.mark.usefixtures("page")
+def test_arrow_keys_count_inside_the_range() -> None:
+    field = WholeNumberField("Number", 1, range(1, 3))
+    for step, value in ((1, "2"), (1, "2"), (-1, "1"), (-1, "1")):
+        field._count(step)
+        assert field.value == value
+
+
 @pytest.mark.parametrize(
-    ("first", "last", "number", "words"),
-    [
-        (0.0, 0.1, 2.5, r"number = 2\.5: must be a whole number, 1 to 1000"),
-        (0.0, 0.1, None, "number: must be a number"),
-        (0.02, 0.02, 3, r"first = last = 0\.02 1/m: must differ"),
-    ],
+    ("remarks", "offered"),
+    [(["damaged", "", ""], "c2"), (["", "in use", ""], None), (["of another mirror", "damaged", "damaged"], None)],
 )
-def test_recipes_that_make_no_sense_are_refused(first: float, last: float, number: float | None, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        view_models.evenly(first, last, number)
+@pytest.mark.usefixtures("page")
+def test_while_no_calibration_is_in_use_the_newest_that_can_be_is_offered(
+    remarks: list[str], offered: str | None
+) -> None:
+    async def call(_name: str, _request: Any) -> ListCalibrations.Response:
+        return ListCalibrations.Response(ids=["c3", "c2", "c1"], held_out_rms=[1e-9, 1e-9, 1e-9], remarks=remarks)
+
+    session, _ = session_of(StateObserver())
+    session.ros.call = call  # type: ignore[assignment]
+    stored = CalibrationCard(session)
+    asyncio.run(stored._list())
+    assert stored._choice.value == offered
+
+
+@pytest.mark.parametrize(("field", "text"), [("_number", "1e9"), ("_conic", ""), ("_first", "x")])
+@pytest.mark.usefixtures("page")
+def test_no_recipes_are_built_from_a_wrong_field(field: str, text: str) -> None:
+    recipes = RecipesCard(session_of(StateObserver())[0])
+    assert len(recipes._goal().curvatures) == 11
+    getattr(recipes, field).set_value(text)
+    with pytest.raises(ValueError, match="must be a"):
+        recipes._goal()
 
 
 def test_a_map_is_waited_for_as_long_as_the_interferometer_is_told_to_take() -> None:

@@ -1,5 +1,6 @@
-"""Ports and folder of a virtual bench."""
+"""Options, ports and folder of a virtual bench."""
 
+import inspect
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -7,8 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dm_tools.demo import figures
-from dm_tools.demo.demo_bench import free_ports, make_empty, usable_folder
+from dm_tools.demo import demo, figures
+from dm_tools.demo.demo_bench import bench_config, free_ports, make_empty, usable_folder
+from dm_tools.doctor.bench import parameters
+
+
+@pytest.mark.parametrize("option", ["creep", "seed", "speed"])
+def test_the_demo_takes_what_its_nodes_take(option: str, tmp_path: Path) -> None:
+    """Else one of them would end, and the demo after it."""
+    (described,) = inspect.signature(demo.demo).parameters[option].annotation.__metadata__
+    for value, right in ((described.min, True), (described.max, True), (2 * described.max, False)):
+        given: dict[str, Any] = {"creep": 0.01, "seed": 1, "speed": 20.0, option: value}
+        assert (parameters(bench_config(tmp_path, "drawn_preisach", **given)) is None) == right, value
 
 
 def test_ports_that_nobody_has_bound_yet_are_not_handed_out_again() -> None:

@@ -51,7 +51,7 @@ def badges(snapshot: Any, doubt: str) -> list[tuple[str, str]]:
         shown.append(("no calibration", "doubt"))
     else:
         kind = "" if calibration.quality == Capabilities.CALIBRATED else "doubt"
-        shown.append((f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}", kind))
+        shown.append((f"{QUALITIES.get(calibration.quality, '?')}: {calibration.id}", kind))
         if calibration.hysteresis.play_radius:
             shown.append(("history: not known", "doubt") if doubt else ("history: known", ""))
     worst = max((ord(bytes(status.level)) for status in snapshot.health.values()), default=0)
@@ -128,15 +128,16 @@ def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> li
 
 
 def now_text(snapshot: Any) -> str:
-    """Present state of the mirror, in one line."""
+    """Present state of the mirror and who holds it, in one line."""
     state = snapshot.actuator_state
     for name in ("pdm_driver", "focus_controller"):
         if name not in snapshot.health or state is None:
             return f"now: not known, {name} is not heard"
+    holds = f"; {state.holder} holds the mirror" if state.holder else ""
     if state.moving:
-        return "now: moving"
+        return f"now: moving{holds}"
     if (shape := settled_shape(snapshot.health)) is None:
-        return "now: not at a curvature that was asked for"
-    return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {in_nanometres(shape.bound)} (95 %)" + (
-        ", held" if shape.held else ""
-    )
+        return f"now: not at a curvature that was asked for{holds}"
+    held = ", held" if shape.held else ""
+    bound = f"within {in_nanometres(shape.bound)} (95 %)"
+    return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, {bound}{held}{holds}"

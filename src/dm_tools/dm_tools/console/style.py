@@ -12,16 +12,17 @@ h1 { font-size: 1.25rem; line-height: 1.6rem; font-weight: 650; margin: 0; }
 h2 { font-size: 1.02rem; line-height: 1.4rem; font-weight: 650; margin: 0; }
 .header { position: sticky; top: 0; z-index: 20; width: 100%; background: var(--page); padding: 6px 0; height: 84px;
   overflow: hidden; display: grid; align-content: start; gap: 4px; grid-template-columns: minmax(0, 1fr); }
-.one { flex-wrap: nowrap; overflow-x: auto; overflow-y: hidden; scrollbar-width: none; white-space: nowrap; }
+.line.one { flex-wrap: nowrap; overflow-x: auto; overflow-y: hidden; scrollbar-width: none; white-space: nowrap; }
 .one .state { flex-wrap: nowrap; }
 .header h1, .header .badge, .header .now { white-space: nowrap; flex: none; }
 .header .outcome { max-height: 2.6rem; overflow-y: auto; flex: 1 1 300px; white-space: normal; }
 .header .below { gap: 4px 12px; }
 .header .now { font-weight: 600; }
 .foot { position: fixed; left: 0; right: 0; bottom: 0; z-index: 30; padding: 0 12px; max-width: 1680px; margin: auto; }
-summary { cursor: pointer; }
+summary { cursor: pointer; display: list-item; }
 summary h2 { display: inline; }
 details.card:not([open]) { gap: 0; }
+.unfolded { box-sizing: border-box; display: grid; grid-template-columns: minmax(0, 1fr); gap: 8px; }
 .pair > details.card:not([open]) { align-self: start; }
 .state { display: flex; flex-wrap: wrap; gap: 8px; }
 .line { display: flex; flex-wrap: wrap; gap: 8px; align-items: center; width: 100%; }
@@ -74,7 +75,14 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); 
 .work .text { flex: 0 1 auto; overflow: hidden; display: -webkit-box; -webkit-box-orient: vertical;
   -webkit-line-clamp: 2; }
 @media (max-width: 1000px) {
-  .header { height: 112px; }
+  .header { height: 120px; padding: 4px 0; gap: 2px; }
+  .header h1 { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }
+  .header .below { gap: 2px 12px; }
+  .header .badge { line-height: 1.2rem; }
+  .badge:first-child { order: 1; }
+  .badge.bad { order: -2; }
+  .badge.doubt { order: -1; }
+  .header .now { white-space: normal; flex: 0 1 auto; }
   .grid, .pair { grid-template-columns: minmax(0, 1fr); }
   .column { display: contents; }
 }

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from dm_common import Bools, Floats
 from dm_common.optics.piston_tilt import remove_plane
+from dm_common.optics.sampling import on_disc
 from dm_controller.planning.active_calibration import model_of
 
 #: Points of the grid along each side. Finer than the print-through of the actuators, coarse enough for a phone.
@@ -88,30 +88,22 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
 class SurfaceModel:
     """The surface that a calibration predicts, on the grid. Shapes: N actuators, K terms.
 
-    Between the sampling points the sag is interpolated by a thin-plate spline.
-
     Raises ValueError, naming the field, for arrays of the calibration that do not fit together.
     """
 
     def __init__(self, calibration: Any) -> None:
-        model = model_of(calibration)
-        self.radius = model.aperture_radius
+        self._model = model = model_of(calibration)
         self.actuators = calibration.actuators
-        self._zernike, self._zernike_offset = model.influence_zernike, model.zernike_offset
-        points = np.column_stack([model.points.x, model.points.y])
-        values = np.column_stack([model.influence_sag, model.sag_offset])
-        x, y, self._inside = _disc()
-        self._sag = RBFInterpolator(points, values)(np.column_stack([x[self._inside], y[self._inside]]))
+        self._sag = on_disc(np.vstack([model.influence_sag.T, model.sag_offset]), model.points, GRID)
 
     def surface(self, effective: Floats) -> Surface:
         """The surface under the effective signals (N,)."""
-        sag = np.full(self._inside.shape, np.nan)
-        sag[self._inside] = self._sag[:, :-1] @ effective + self._sag[:, -1]
-        return Surface(remove_plane(sag), self.radius)
+        sag = (np.tensordot(effective, self._sag[:-1], 1) + self._sag[-1])[::-1]  # row 0 = top
+        return Surface(remove_plane(np.where(_disc()[2], sag, np.nan)), self._model.aperture_radius)
 
     def coefficients(self, effective: Floats) -> Floats:
         """(K,) m under the effective signals (N,)."""
-        return np.asarray(self._zernike @ effective + self._zernike_offset)
+        return np.asarray(self._model.influence_zernike @ effective + self._model.zernike_offset)
 
 
 def difference(measured: Surface, predicted: Surface) -> Surface:

@@ -12,10 +12,9 @@ from matplotlib.colors import to_hex
 
 from dm_common import SIGMAS_95, Floats
 from dm_common.figures import with_point
+from dm_common.mirror import actuators_text
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 
-#: Largest number of recipes in one run.
-NUMBER_MAX = 1000
 SIGNAL_COLOURS = colormaps["cividis"]  # taken once: each time Matplotlib makes a copy, whose table it computes anew
 QUALITIES = {
     Capabilities.UNCALIBRATED: "uncalibrated",
@@ -195,7 +194,7 @@ def prediction_text(state: Any) -> str:
         text += f", shape reached after {state.predicted_duration:.2f} s"
     text += f". Mode: {MODES.get(state.mode, '?').lower()}."
     if state.saturated:
-        text += f" Saturated: actuators {', '.join(map(str, state.saturated_actuators))}."
+        text += f" Saturated: {actuators_text(state.saturated_actuators)}."
     if not state.history_known:
         text += " The history of the actuators is not known: a degauss would make this better."
     return text
@@ -215,6 +214,8 @@ def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: fl
 
 def moved(signal: float, amplitude: float, low: float, high: float) -> float:
     """`signal` moved by `amplitude`, in the other direction where the range ends. Raises ValueError when both fail."""
+    if amplitude == 0.0:
+        raise ValueError("amplitude = 0: must not be 0, or nothing moves")
     for there in (signal + amplitude, signal - amplitude):
         if low <= there <= high:
             return there
@@ -223,6 +224,8 @@ def moved(signal: float, amplitude: float, low: float, high: float) -> float:
 
 def decimal(text: str | None) -> float | None:
     """The number in `text`, with a decimal point or comma; None = not a number."""
+    if "_" in (text or ""):  # a mistyped minus, which Python would overlook: 1_0 is 10 to it
+        return None
     try:
         value = float(with_point(text or ""))
     except ValueError:
@@ -230,17 +233,31 @@ def decimal(text: str | None) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
-    """`number` curvatures from `first` to `last`, 1/m. Raises ValueError naming the field that is not valid."""
-    for name, value in (("first", first), ("last", last), ("number", number)):
-        if value is None or not math.isfinite(value):
-            raise ValueError(f"{name}: must be a number")
-    assert first is not None and last is not None and number is not None
-    if not (float(number).is_integer() and 1 <= number <= NUMBER_MAX):
-        raise ValueError(f"number = {number:g}: must be a whole number, 1 to {NUMBER_MAX}")
+def number_in(name: str, text: str | None) -> float:
+    """The number typed into the field `name`. Raises ValueError with the field and what was typed."""
+    if (value := decimal(text)) is None:
+        raise ValueError(f"{_typed(name, text)}: must be a number")
+    return value
+
+
+def whole_number_in(name: str, text: str | None, allowed: range) -> int:
+    """The whole number typed into the field `name`. Raises ValueError with field, what was typed, and the range."""
+    value = decimal(text)
+    if value is None or not (value.is_integer() and int(value) in allowed):
+        raise ValueError(f"{_typed(name, text)}: must be a whole number, {allowed[0]} to {allowed[-1]}")
+    return int(value)
+
+
+def _typed(name: str, text: str | None) -> str:
+    shown = (text or "").strip()
+    return f"{name} = {shown}" if shown else name
+
+
+def evenly(first: float, last: float, number: int) -> list[float]:
+    """`number` curvatures from `first` to `last`, 1/m. Raises ValueError when several would be the same."""
     if first == last and number > 1:
-        raise ValueError(f"first = last = {first:g} 1/m: must differ, or number must be 1")
-    return [round(value, 9) for value in np.linspace(first, last, int(number)).tolist()]
+        raise ValueError(f"first = last = {first:g} 1/m: must differ, or recipes must be 1")
+    return [round(value, 9) for value in np.linspace(first, last, number).tolist()]
 
 
 def calibration_text(calibration: Any) -> list[str]:

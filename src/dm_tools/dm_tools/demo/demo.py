@@ -125,10 +125,12 @@ def demo(
         ),
     ] = Hysteresis.drawn_preisach,
     creep: Annotated[
-        float | None, typer.Option(min=0.0, max=0.2, help="Creep per decade of time; default 0.01.")
+        float | None, typer.Option(min=0.0, max=0.1, help="Creep per decade of time; default 0.01.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the simulation.")] = 1,
-    speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of the simulation.")] = 1,
+    speed: Annotated[
+        float, typer.Option(min=0.0, max=3600.0, help="How much faster than real time; 0 = real time.")
+    ] = 20.0,
     hysteresis_maps: Annotated[
         int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
     ] = MAPS,
@@ -189,7 +191,7 @@ def demo(
             wait_for_calibration(client, result.id)
             console.print(f"reachable: {client.capabilities.message}")
             mirror = client.mirror_info
-            settle = effective("calibration", config["calibration"])["settle_time"]
+            settle = effective(config, "calibration")["settle_time"]
             rows, without_hysteresis = sweep(client, settle), []
             ends = rows[0]["curvature"], rows[-1]["curvature"]
             fitting_limit = best_possible(client.latest("calibration"), mirror, ends)

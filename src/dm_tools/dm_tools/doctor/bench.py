@@ -50,21 +50,21 @@ def bench_checks(file: Path, namespace: str = "") -> Iterator[Check]:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
     yield "aperture of the maps", lambda: aperture_fits(config)
     yield "record of creep", lambda: one_record(config)
-    interferometer, driver = (effective(name, config.get(name, {})) for name in ("interferometer", "pdm_driver"))
+    driver, interferometer = effective(config, "pdm_driver"), effective(config, "interferometer")
     yield "trigger command", lambda: trigger_program(interferometer["trigger_command"])
     made = "virtual_bench" in config
     if made:
-        yield "ports of the virtual bench", lambda: taken_ports(config["virtual_bench"])
+        yield "ports of the virtual bench", lambda: taken_ports(config)
     else:
         yield from electronics_checks(driver)
     for name in ("pdm_driver", "focus_controller"):
-        if folder := effective(name, config.get(name, {}))["state_folder"]:
+        if folder := effective(config, name)["state_folder"]:
             yield f"state folder of {name}", partial(writable_folder, ros_home(folder))
     if interferometer["watch_folder"]:
         watched = Path(interferometer["watch_folder"]).expanduser()
         writes = "{path}" in " ".join(interferometer["trigger_command"])
         yield f"watched folder {watched}", lambda: watched_folder(watched, writes, made)
-    calibration = effective("calibration", config.get("calibration", {}))
+    calibration = effective(config, "calibration")
     if calibration["calibration_folder"]:
         store = Path(calibration["calibration_folder"]).expanduser()
         yield f"calibration folder {store}", lambda: writable_folder(store)
@@ -78,8 +78,9 @@ def _known(name: str) -> dict[str, Parameter]:
     return {item.name: item for node in NODES if node.name == name for item in (*node.load_parameters(), COMMON)}
 
 
-def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """All values of a node: of those `given` the ones that are set and valid, and defaults for the others."""
+def effective(config: Config, name: str) -> dict[str, Any]:
+    """All values of a node: of those in its section the ones that are set and valid, and defaults for the others."""
+    given = config.get(name, {})
     problems = _problems(name, given)
     valid = {key: value for key, value in given.items() if value != UNSET and key not in problems}
     return {item.name: item.default for item in _known(name).values()} | valid
@@ -125,7 +126,7 @@ def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
     if configuring is None or missing or own_values(own) or parameters(own):
         return None  # nothing to check, or reported already
     try:
-        configuring(effective(node.name, own[node.name]))
+        configuring(effective(own, node.name))
     except ValueError as error:
         return Finding(str(error), f"correct the value; {node.name} refuses to configure with it")
     return None
@@ -135,12 +136,12 @@ def aperture_fits(config: Config) -> Finding | None:
     """Whether the aperture that is configured for maps lies on the mirror, and is the working aperture."""
     from dm_calibration.acquisition.ingest import too_large
 
-    radius = effective("interferometer", config.get("interferometer", {}))["aperture.radius"]
-    driver = effective("pdm_driver", config.get("pdm_driver", {}))
+    radius = effective(config, "interferometer")["aperture.radius"]
+    driver = effective(config, "pdm_driver")
     if problem := too_large(radius, 0.5 * driver["mirror.full_aperture_diameter"]):
         return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver")
     working = 0.5 * driver["mirror.working_aperture_diameter"]
-    tolerance = effective("calibration", config.get("calibration", {}))["aperture_tolerance"]
+    tolerance = effective(config, "calibration")["aperture_tolerance"]
     if radius > 0.0 and "pdm_driver" in config and abs(radius - working) > tolerance * working:
         problem = f"aperture.radius = {radius:g} m: the working aperture of the mirror has a radius of {working:g} m"
         return Finding(problem, "correct it, or mirror.working_aperture_diameter of pdm_driver: maps would be refused")
@@ -150,7 +151,7 @@ def aperture_fits(config: Config) -> Finding | None:
 def one_record(config: Config) -> Finding | None:
     """Whether both nodes that follow the actuators begin with the same record of what these have crept to."""
     nodes = ("focus_controller", "calibration")
-    folders = {node: effective(node, config.get(node, {}))["state_folder"] for node in nodes}
+    folders = {node: effective(config, node)["state_folder"] for node in nodes}
     if len(set(folders.values())) < 2:
         return None
     listed = ", ".join(f"{node}: {folder!r}" for node, folder in folders.items())
@@ -166,9 +167,9 @@ def trigger_program(command: Sequence[str]) -> Finding | None:
     return Finding(f"trigger_command = {command[0]!r}, ...: no such program", "correct it, or give its whole path")
 
 
-def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Ports of the bench that other programs hold; None = all are free. For a wrong value its default is tried."""
-    values, taken = effective("virtual_bench", bench), []
+def taken_ports(config: Config) -> Finding | None:
+    """Ports of the virtual bench that other programs hold; None = all are free. A wrong value counts as its default."""
+    values, taken = effective(config, "virtual_bench"), []
     for name, protocol in BENCH_PORTS.items():
         port, kind = values[name], socket.SOCK_STREAM if protocol == "TCP" else socket.SOCK_DGRAM
         if port <= 0:

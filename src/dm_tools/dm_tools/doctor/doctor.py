@@ -44,12 +44,12 @@ def doctor(
             mark = "[yellow]note[/] " if finding.note else "[red]WRONG[/]"
             console.print(mark, Text(f"{name}: {finding.problem}\n      cure: {finding.cure}"))
     write_json(json, {"doctor": {name: found and found._asdict() for name, found in findings.items()}})
+    file = f" --config {quote(str(config))}" if config else ""
     if wrong := sum(bool(finding and finding.cure and not finding.note) for finding in findings.values()):
-        next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again", namespace)
+        next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor{file} again", namespace)
         raise typer.Exit(1)
     running = findings["nodes that are running"]
-    start = f"./dm up{f' --config {quote(str(config))}' if config else ''}"
-    next_step("./dm status" if running and not running.cure else start, namespace)
+    next_step("./dm status" if running and not running.cure else f"./dm up{file}", namespace)
 
 
 def held_by_the_nodes(check: str, finding: Finding | None, running: Finding | None) -> Finding | None:

@@ -37,12 +37,10 @@ def opens(kind: str, driver: Mapping[str, Any]) -> Finding | None:
     address, port, channels = (driver[name] for name in ("electronics.address", "electronics.port", "mirror.actuators"))
     settings = ElectronicsSettings(address, port, channels=channels)
     try:
-        electronics = BACK_ENDS[kind](settings)
-        electronics.open()
-        electronics.close()
+        with BACK_ENDS[kind](settings):
+            return None
     except (LinkError, ValueError) as error:
         return Finding(str(error), CURES[kind])
-    return None
 
 
 def answers_discovery(address: str, port: int) -> Finding | None:

@@ -79,7 +79,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     if not runs:
         raise RecordingError(f"{bag.path}: no calibration was run in it (no message on {prefix}{FEEDBACK})")
     if not 0 <= number <= len(runs):
-        raise RecordingError(f"run {number}: the recording has 1 to {len(runs)}; 0 = the last")
+        raise RecordingError(f"run = {number}: must be 1 to {len(runs)}, or 0 (the last)")
     index = (number or len(runs)) - 1
     (begun, first), (ended, _last) = runs[index][0], runs[index][-1]
     end = runs[index + 1][0][0] if index + 1 < len(runs) else np.iinfo(np.int64).max

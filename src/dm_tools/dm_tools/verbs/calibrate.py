@@ -138,7 +138,7 @@ def after_run(result: Any, written: Path | None, used: bool = True) -> str:
     if result.parameters:  # they correct which actuators are neighbours for the limits, and where the aperture is
         return f"start the nodes with {written or 'these parameters'}, and calibrate again"
     if result.id and not used:
-        return f"the service load_calibration with calibration: {result.id} puts it into use"
+        return f"./dm console puts it into use, as does load_calibration with calibration: {result.id}"
     return "./dm focus 0.02" if result.id else "./dm calibrate" if result.poke_check_passed else ""
 
 

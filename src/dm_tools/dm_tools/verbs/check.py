@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from dm_common.figures import accuracy_text
+from dm_common.figures import accuracy_text, counted
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import (
     BUSY_S,
@@ -78,10 +78,9 @@ def check(
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}")
         elif without:
             console.print(response.message)
-    maps = f"{response.revision} map{'' if response.revision == 1 else 's'}"
     console.print(
-        f"since the calibration was made: {maps} used for updates, gains changed by up to {response.gain_drift:.2%}, "
-        f"the figure by {1e9 * response.offset_drift:.2f} nm rms"
+        f"since the calibration was made: {counted(response.revision, 'map')} used for updates, gains changed by up to "
+        f"{response.gain_drift:.2%}, the figure by {1e9 * response.offset_drift:.2f} nm rms"
     )
     names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
     write_json(json, {"check": figures(response, *names) | {"promised_nm": 1e9 * promised}})
@@ -93,6 +92,8 @@ def check(
         then = "one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate"
     elif without and dry_run:
         then = "the same command without --dry-run continues so; nothing is changed yet"
+    elif without and "check another shape" in response.message:
+        then = "./dm focus to another curvature, then ./dm check: bounds stay wide until a map shows that it is stuck"
     elif without:
         then = "ask for the shape again: the present command still relies on all actuators; ./dm status shows the range"
     elif lost and not forget:

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import accuracy_text, in_nanometres
+from dm_common.mirror import actuators_text
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import MENTIONED, REPORT_S, latest_message, naming_holder, promise, running_suite
@@ -16,6 +17,9 @@ def focus(
         bool, typer.Option("--dioptre", help="The number is the optical power = 2 x curvature.")
     ] = False,
     conic: Annotated[float, typer.Option(help="Conic constant: 0 = sphere, -1 = paraboloid.")] = 0.0,
+    conditioned: Annotated[
+        bool, typer.Option("--conditioned", help="Degauss, then go by the recipes: most accurate, takes seconds.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
     wait: Annotated[bool, typer.Option(help="Return when the shape is reached.")] = True,
     take_over: TakeOverOption = False,
@@ -23,26 +27,29 @@ def focus(
     json: JsonOption = None,
 ) -> None:
     """Ask for a curvature: print the promised accuracy, then move."""
+    from dm_msgs.msg import FocusRequest
+
     from dm_client import DeformableMirrorError
 
     wanted = curvature / 2.0 if dioptre else curvature
+    mode = FocusRequest.MODE_CONDITIONED if conditioned else FocusRequest.MODE_AUTO
     with running_suite(namespace) as client, naming_holder(client):
         try:
-            state = client.focus(wanted, conic, dry_run=True)
+            state = client.focus(wanted, conic, dry_run=True, mode=mode)
             _show(state, latest_message(client, "calibration", REPORT_S))
             if not dry_run and wait:
-                result = client.move_focus(wanted, conic, take_over=take_over)
+                result = client.move_focus(wanted, conic, mode=mode, take_over=take_over)
                 state = result.state
                 console.print(f"the shape is reached after {result.duration * 1e3:.0f} ms{_held(state)}")
             elif not dry_run:
-                state = client.focus(wanted, conic, take_over=take_over)
+                state = client.focus(wanted, conic, mode=mode, take_over=take_over)
         except DeformableMirrorError as error:
             if error.response is not None:
                 refused = {"curvature": wanted, "error_code": error.error_code, "message": str(error)}
                 write_json(json, {"focus": [refused]})
             raise
     write_json(json, {"focus": [figures_of(state)]})
-    _show_next(state, namespace)
+    _show_next(state, namespace, dry_run)
 
 
 def flatten(
@@ -58,7 +65,7 @@ def flatten(
     if state.applied:
         console.print(f"commanded{_held(state)}")
     write_json(json, {"focus": [figures_of(state)]})
-    _show_next(state, namespace)
+    _show_next(state, namespace, dry_run)
 
 
 def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", json: JsonOption = None) -> None:
@@ -89,7 +96,7 @@ def _show(state: Any, calibration: Any) -> None:
     if calibration is not None:
         console.print(accuracy_text(state.predicted_max_zernike_upper - predicted, calibration, state.curvature))
     if state.saturated:
-        console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
+        console.print(f"[yellow]saturated[/]: {actuators_text(state.saturated_actuators)} at a limit")
     if remarks := state.message.partition("; ")[2]:
         console.print(remarks, style="yellow", markup=False)
 
@@ -98,9 +105,11 @@ def _held(state: Any) -> str:
     return " and is held against creep" if state.creep_held else ""
 
 
-def _show_next(state: Any, namespace: str) -> None:
-    if not state.applied:
+def _show_next(state: Any, namespace: str, dry_run: bool) -> None:
+    if dry_run:
         next_step("the same without --dry-run moves the mirror")
+    elif not state.applied:
+        next_step("./dm status shows the shape after the degauss", namespace)
     elif not state.history_known:
         next_step("./dm degauss, then ask again: the error bound is then smaller", namespace)
     else:

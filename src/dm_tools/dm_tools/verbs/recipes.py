@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import with_point
+from dm_common.figures import counted, with_point
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -16,7 +16,11 @@ from dm_tools.output import (
     progress_bar,
     write_json,
 )
+from dm_tools.parameter_changes import get_parameter
 from dm_tools.running_suite import naming_holder, running_suite, usual_spheres
+
+#: Rounds that a recipe takes, on average of simulated mirrors.
+ROUNDS = 2
 
 
 def curvatures_of(text: str) -> list[float]:
@@ -34,7 +38,7 @@ def curvatures_of(text: str) -> list[float]:
             f"curvatures = {text!r}: must be like -0.02,0,0.02, below 1 1/m, or like -0.05:0.05:11"
         ) from error
     if len(parts) != 3 or not (2 <= number <= 1000 and math.isfinite(first) and math.isfinite(last)):
-        raise typer.BadParameter(f"curvatures = {text!r}: first:last:number, with 2 to 1000 of them")
+        raise typer.BadParameter(f"curvatures = {text!r}: must be first:last:number, the number 2 to 1000")
     step = (last - first) / (number - 1)
     return [round(first + k * step, 12) for k in range(number)]
 
@@ -59,6 +63,14 @@ def _build(client: Any, curvatures: list[float], conic: float, zernike: list[flo
     return result
 
 
+def expected_run(client: Any, number: int) -> str:
+    """Expected duration of a run of this many recipes: a round is a degauss, a wait and the maps that are averaged."""
+    wanted = {"focus_controller": ("converge.settle_time", "recipes.average"), "calibration": ("map_time",)}
+    settle, average, each = (get_parameter(client, node, name) for node, names in wanted.items() for name in names)
+    duration = ROUNDS * number * (client.capabilities.condition_time + settle + average * each)
+    return f"{counted(number, 'recipe')} in about {duration:.0f} s if a map takes {each:g} s"
+
+
 def _figures(book: Any) -> dict[str, Any]:
     recipes = [
         figures(recipe, "curvature", "conic_constant", "max_zernike_nm", "rms_nm", "maps")
@@ -71,7 +83,10 @@ def _figures(book: Any) -> dict[str, Any]:
 def next_of(book: Any) -> str:
     """What to do next, given the recipes of the calibration in use, a dm_msgs/RecipeBook."""
     if book.recipes:
-        return "requests with `mode: conditioned`, or with a time budget, use them (docs/recipes.md)"
+        spheres = (each.curvature for each in book.recipes if not (each.conic_constant or any(each.zernike)))
+        if (sphere := next(spheres, None)) is None:
+            return "requests of these shapes with `mode: conditioned` use them (docs/recipes.md)"
+        return f"./dm focus {sphere:g} --conditioned, or `mode: conditioned` of a request, uses them"
     if not book.calibration_id:
         return "./dm calibrate"
     return "./dm check shows why (docs/stay-true.md)" if book.degauss_steps else "./dm recipes"
@@ -122,6 +137,7 @@ def recipes(
             each = usual_spheres(client.capabilities) if chosen is None else chosen
             wanted = [curvature for curvature in each for _ in shapes]
             terms = [term for _ in each for shape in shapes for term in shape]
+            console.print(f"expected: {expected_run(client, len(wanted))}")
             result = _build(
                 client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
             )

@@ -86,8 +86,9 @@ def _recalibrated(bag: Any, run: int, namespace: str, store: Path | None, config
     for remark in session.remarks:
         console.print(f"[yellow]remark[/] {remark}")
     fit = calibration.fit
+    maps = int(calibration.maps.has_map.sum())
     console.print(
-        f"{int(fit.used.sum())} of {len(calibration.maps)} maps, residual {1e9 * fit.in_sample_rms:.2f} nm "
+        f"{int(fit.used.sum())} of {maps} maps, residual {1e9 * fit.in_sample_rms:.2f} nm "
         f"in-sample, {1e9 * fit.held_out_rms:.2f} nm held out"
     )
     published = session.published
@@ -103,7 +104,7 @@ def _recalibrated(bag: Any, run: int, namespace: str, store: Path | None, config
         file = str(folder.save(calibration))
         console.print(f"stored: {file}")
     return {
-        "maps": len(calibration.maps),
+        "maps": maps,
         **figures(fit, "in_sample_rms_nm", "held_out_rms_nm"),
         "compared_with": published.id if published is not None else None,
         "identical": None if differing is None else not differing,

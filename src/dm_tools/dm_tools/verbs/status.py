@@ -2,6 +2,8 @@
 
 import math
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from dm_common.errors import ErrorCode
@@ -9,8 +11,8 @@ from dm_common.figures import accuracy_text
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, console, in_namespace, write_json
 from dm_tools.running_suite import (
+    BUSY_S,
     NEEDED,
-    REPORT_S,
     SettledShape,
     ago,
     calibration_refused,
@@ -23,6 +25,7 @@ from dm_tools.running_suite import (
     unknown_history,
     where,
 )
+from dm_tools.verbs.up import poke_check
 
 #: A node not found within this time is not running, s: each announces itself every second; a busy machine may miss it.
 MISSING_S = 10.0
@@ -33,8 +36,8 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     with running_suite(namespace) as client:
         times: list[int] = []
         health = receive_health(client, times)
-        client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
-        client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), MISSING_S - REPORT_S)
+        client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), MISSING_S)
+        client.wait(lambda: not _silent(nodes_of_suite(client), health), BUSY_S)
         client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
         by = holder(client)
         found, place = nodes_of_suite(client), where(client)
@@ -53,8 +56,10 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "calibration": _calibration(latest, times[-1] if times else time.time()),
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
-        "health": _health(health),
-        "next": in_namespace(_next(lacking, by, state, calibration, shape, capabilities), namespace),
+        "health": _health(health, _silent(found, health)),
+        "next": in_namespace(
+            _next(lacking, by, state, calibration, shape, capabilities, "virtual_bench" in found), namespace
+        ),
     }
     for name, text in rows.items():
         console.print(f"[bold]{name:12s}[/]{text}")
@@ -70,9 +75,14 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     write_json(json, {"status": figures})
 
 
-def _health(health: dict[str, Any]) -> str:
-    """Health messages of the nodes that are not well, each sentence once."""
-    said: dict[str, list[str]] = {}
+def _silent(found: Mapping[str, int], health: dict[str, Any]) -> list[str]:
+    """The nodes in `found` that have not reported their health."""
+    return [name for name in NEEDED if found[name] and name not in health]
+
+
+def _health(health: dict[str, Any], silent: list[str]) -> str:
+    """Health messages of the nodes that are not well, each sentence once; `silent` nodes have not said how they are."""
+    said: dict[str, list[str]] = {"not heard": silent} if silent else {}
     for name, each in health.items():
         if each.level != b"\0":
             said.setdefault(each.message, []).append(name)
@@ -129,7 +139,15 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
     return accuracy_text(capabilities.error_bound, calibration, farthest) + at
 
 
-def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
+def _next(
+    lacking: list[str],
+    by: str,
+    state: Any,
+    calibration: Any,
+    shape: SettledShape | None,
+    capabilities: Any,
+    simulated: bool = False,
+) -> str:
     if lacking:
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
     if state is not None and state.driver_state == state.STATE_LINK_LOST:
@@ -142,8 +160,14 @@ def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any,
         return str(capabilities.message)
     if by:
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
+    if calibration is None and not simulated and not calibration_refused(capabilities):
+        return f"./dm {poke_check(Path('FILE'))}; when it finds the wiring as configured, ./dm calibrate"
     if calibration is None or not calibration.hysteresis.play_radius or calibration_refused(capabilities):
         return "./dm calibrate"
     if unknown_history(capabilities):
         return "./dm degauss: the actuators' history is not known, and the promise is wider for it"
-    return "./dm check" if shape is not None else "./dm focus 0.02"
+    if shape is None:
+        return "./dm focus 0.02"
+    if capabilities is not None and shape.predicted > capabilities.residual_tolerance:  # as refused when asked for now
+        return "ask for the shape again: its command is from before the calibration changed, and misses it now"
+    return "./dm check"

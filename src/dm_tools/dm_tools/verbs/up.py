@@ -93,11 +93,13 @@ def up(
         for name, configuration in mirrors.items():
             stack.enter_context(only_suite(name))
             # Otherwise a driver would take the mirror of another bench for its own.
-            if taken := taken_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
+            if "virtual_bench" in configuration and (taken := taken_ports(configuration)):
                 raise RuntimeError(f"virtual_bench: {taken.problem}: {taken.cure}")
         # Closed after the suites, which make the mirrors safe first.
         watches = [
-            stack.enter_context(contextlib.closing(say_when_ready(name, file)))
+            stack.enter_context(
+                contextlib.closing(say_when_ready(name, None if "virtual_bench" in mirrors[name] else file))
+            )
             for name, file in itertools.zip_longest(mirrors, config or [])
         ]
         folder = logs if logs is not None else Path(temporary)
@@ -108,7 +110,7 @@ def up(
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
             if kind == "virtual bench":
-                bench = effective("virtual_bench", configuration["virtual_bench"])
+                bench = effective(configuration, "virtual_bench")
                 console.print(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
@@ -183,12 +185,18 @@ def say_when_ready(namespace: str, file: Path | None) -> Generator[None, None, N
 
 
 def first_command(capabilities: Any, file: Path | None) -> str:
-    """First command for a suite that `file` configures; None = the shipped virtual bench, whose wiring is correct."""
+    """First command for a suite that `file` configures; None = a virtual bench, whose wiring its own file says."""
     if capabilities.calibration_id:
         return "degauss" if unknown_history(capabilities) else "focus 0.02"
     if file is None or calibration_refused(capabilities):
         return "calibrate"
-    return f"calibrate --plan poke-check --config {quote(str(file))} --write found.yaml"
+    return poke_check(file)
+
+
+def poke_check(file: Path) -> str:
+    """Command that checks the wiring of the bench that `file` configures, and writes what differs to another file."""
+    found = "found_again.yaml" if file.name == "found.yaml" else "found.yaml"
+    return f"calibrate --plan poke-check --config {quote(str(file))} --write {found}"
 
 
 def configurations(files: list[Path], namespaces: list[str], camera: bool = False) -> dict[str, Config]:
@@ -242,9 +250,7 @@ def _own(config: Config) -> Iterator[tuple[str, Any]]:
     from dm_driver.electronics import BACK_ENDS
     from dm_tools.doctor.bench import BENCH_PORTS, effective
 
-    values = {node: effective(node, given) for node, given in config.items()}
-    driver, bench = values["pdm_driver"], values.get("virtual_bench", {})
-    folder = effective("calibration", values.get("calibration", {}))["calibration_folder"]
+    driver, folder = effective(config, "pdm_driver"), effective(config, "calibration")["calibration_folder"]
     yield (
         "mirror.serial, calibration_folder",
         f"{config['pdm_driver'].get('mirror.serial')}, {Path(folder).expanduser()}",
@@ -252,10 +258,11 @@ def _own(config: Config) -> Iterator[tuple[str, Any]]:
     kind = driver["electronics.kind"]
     if kind in BACK_ENDS and (place := driver[name := f"electronics.{BACK_ENDS[kind].needs[0]}"]):
         yield name, f"{place}:{driver['electronics.port']}" if kind.startswith("edac40") else Path(place).expanduser()
-    if watched := values.get("interferometer", {}).get("watch_folder"):
+    if watched := effective(config, "interferometer")["watch_folder"]:
         yield "watch_folder", Path(watched).expanduser()
-    for name, protocol in BENCH_PORTS.items():
-        if bench.get(name, 0) > 0:  # 0 = any that is free
+    bench = effective(config, "virtual_bench")
+    for name, protocol in BENCH_PORTS.items() if "virtual_bench" in config else ():
+        if bench[name] > 0:  # 0 = any that is free
             yield f"{protocol} port of virtual_bench", bench[name]
 
 

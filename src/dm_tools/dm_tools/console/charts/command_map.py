@@ -24,10 +24,11 @@ CIRCLE = 91
 #: JavaScript that draws an actuator's cell: its outline, and its number and signal as large as they fit.
 DRAW = """(params, api) => {
   const cell = %s[params.dataIndex], [x, y] = api.coord(cell.place), size = api.size([cell.size, 0])[0];
-  const label = (content, dy, share, weight) => ({type: 'text', x, y: y + dy * size, style: {text: content,
-    fill: cell.ink, fontSize: share * size, fontWeight: weight, align: 'center', verticalAlign: 'middle'}});
+  const label = (content, dy, share, weight) => ({type: 'text', z2: cell.z2, x, y: y + dy * size,
+    style: {text: content, fill: cell.ink, fontSize: share * size, fontWeight: weight,
+    align: 'center', verticalAlign: 'middle'}});
   return {type: 'group', children: [
-    {type: 'polygon', shape: {points: cell.corners.map((corner) => api.coord(corner))},
+    {type: 'polygon', z2: cell.z2, shape: {points: cell.corners.map((corner) => api.coord(corner))},
       style: {fill: cell.fill, stroke: cell.edge, lineWidth: cell.width, lineJoin: 'round'}},
     label(cell.label, -0.28, 0.53, 600), label(cell.signal, 0.3, 0.46, 400)]};
 }"""
@@ -38,9 +39,7 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
 
     The third value of each datum is the actuator's number.
     """
-    # The chosen actuator is drawn last: its outline must not be covered.
-    in_order = sorted(cells, key=lambda cell: cell.number == chosen)
-    shapes = outlines(tuple((cell.x, cell.y) for cell in in_order))
+    shapes = outlines(tuple((cell.x, cell.y) for cell in cells))
     reach = 1.01 * max([aperture_radius_mm, *(float(np.abs(corners).max()) for corners, _size in shapes)])
     drawn = [
         {
@@ -51,10 +50,11 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
             "ink": ink_on(cell.fill),
             "edge": VERMILION if cell.number == chosen else "#ffffff",
             "width": 4 if cell.number == chosen else 1.5,
+            "z2": int(cell.number == chosen),  # its outline must not be covered: a chart that changes keeps the order
             "label": f"{cell.number} {cell.mark}".strip(),
             "signal": "" if cell.signal is None else f"{cell.signal:+.2f}".replace("-", "−"),
         }
-        for cell, (corners, size) in zip(in_order, shapes, strict=True)
+        for cell, (corners, size) in zip(cells, shapes, strict=True)
     ]
     angle = np.linspace(0.0, 2.0 * np.pi, CIRCLE)
     circle = aperture_radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -83,7 +83,7 @@ def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float, l
             {
                 "type": "custom",
                 ":renderItem": DRAW % json.dumps(drawn),
-                "data": [{"value": [cell.x, cell.y, cell.number], "name": cell.text} for cell in in_order],
+                "data": [{"value": [cell.x, cell.y, cell.number], "name": cell.text} for cell in cells],
             },
             {
                 "type": "line",

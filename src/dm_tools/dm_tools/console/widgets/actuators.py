@@ -1,5 +1,6 @@
 """The cards of the actuators: command map, poke, hysteresis loop."""
 
+import contextlib
 import dataclasses
 import math
 from functools import partial
@@ -15,7 +16,7 @@ from dm_tools.console.loops import modelled_loop
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import Cell, cells, towards
-from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card
+from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, WholeNumberField, card
 
 ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
 
@@ -40,10 +41,7 @@ class ActuatorCards:
             with card("Actuator"):
                 self._text = Line("text figures", live=True)
                 with ui.element("div").classes("line"):
-                    self._number = ui.number(
-                        "Number", value=session.chosen, min=1, step=1, format="%d", on_change=self._typed
-                    )
-                    self._number.classes("w-20")
+                    self._number = WholeNumberField("Number", session.chosen, range(1, 2), self._typed).classes("w-20")
                     self._amplitude = DecimalField("Amplitude", 0.3).classes("w-24")
                 with ui.element("div").classes("line"):
                     self._on_click = ui.switch("Poke by click")
@@ -65,16 +63,12 @@ class ActuatorCards:
             self._poke()
 
     def _typed(self) -> None:
-        if (value := self._number.value) in self._numbers:
-            self._session.chosen = self._followed = int(value)
-
-    @property
-    def _numbers(self) -> range:
-        return range(1, max(len(self._cells), 1) + 1)
+        with contextlib.suppress(ValueError):
+            self._session.chosen = self._followed = self._number.valid_number
 
     def _choose(self, number: int) -> None:
         self._session.chosen = self._followed = number
-        self._number.set_value(number)
+        self._number.set_number(number)
 
     def _step(self, direction: float) -> None:
         if self._cells:
@@ -86,40 +80,35 @@ class ActuatorCards:
 
     # --- moving ---
 
-    def _typed_number(self, title: str) -> int | None:
-        """Number in the field, which may differ from the one shown; None = no such actuator, reported as a failure."""
-        if (value := self._number.value) in self._numbers:
-            return int(value)
-        shown = "" if value is None else f" = {value:g}"
-        self._session.fail(title, f"number{shown}: must be a whole number, 1 to {self._numbers[-1]}")
-        return None
-
-    def _swing(self) -> float:
-        """The amplitude in the field. Raises ValueError when it is not a number."""
-        if (amplitude := self._amplitude.number) is None:
-            raise ValueError("the amplitude must be a number")
-        return amplitude
+    def _fields(self, title: str) -> tuple[int, float] | None:
+        """Actuator, which may differ from the one shown, and amplitude as typed; None = refused, with a message."""
+        try:
+            return self._number.valid_number, self._amplitude.valid_number
+        except ValueError as error:
+            self._session.fail(title, str(error))
+            return None
 
     def _poke(self) -> None:
         session, snapshot = self._session, self._session.snapshot()
-        if (number := self._typed_number("Poke")) is None:
+        if (fields := self._fields("Poke")) is None:
             return
+        title = f"Poke {fields[0]}"
         reason = reason_against("move", snapshot, session.running)
         if reason:
-            session.fail(f"Poke {number}", reason)
+            session.fail(title, reason)
             return
         maps = bool(self._with_map.value) and not reason_against("measure", snapshot, "")
-        session.begin(f"Poke {number}", lambda _session: operations.poke(session, number, self._swing(), maps))
+        session.begin(title, lambda _session: operations.poke(session, *fields, maps))
 
     def _start_release(self) -> None:
         self._session.begin("Release", operations.release)
 
     def _start_loop(self) -> None:
         session = self._session
-        if (number := self._typed_number("Loop")) is None:
+        if (fields := self._fields("Loop")) is None:
             return
-        title = f"Loop of actuator {number}"
-        session.begin(title, lambda _session: operations.measure_loop(session, number, self._swing()), cancel="")
+        title = f"Loop of actuator {fields[0]}"
+        session.begin(title, lambda _session: operations.measure_loop(session, *fields), cancel="")
 
     # --- showing ---
 
@@ -134,6 +123,7 @@ class ActuatorCards:
             self._picture.show(None, "The driver has not published its actuators yet.")
             return
         self._cells = cells(mirror, snapshot.actuator_state, snapshot.calibration)
+        self._number.allowed = range(1, len(self._cells) + 1)
         session.chosen = min(session.chosen, len(self._cells))
         if session.chosen != self._followed:  # chosen on another page
             self._choose(session.chosen)

@@ -8,6 +8,7 @@ from dm_msgs.action import BuildRecipes, Calibrate
 from dm_msgs.srv import ListCalibrations
 from nicegui import background_tasks, ui
 
+from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_common.errors import Refusal
 from dm_common.recipes import recipe_row, terms_of
 from dm_tools.console import operations
@@ -15,11 +16,13 @@ from dm_tools.console.charts.plots import residual_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
-from dm_tools.console.view_models import NUMBER_MAX, calibration_text, evenly
-from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card
+from dm_tools.console.view_models import calibration_text, evenly
+from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, WholeNumberField, card
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
+#: Numbers of recipes in one run, and of commands in one calibration.
+NUMBERS, LENGTHS = range(1, 1001), range(MAPS_MIN, MAPS_MAX + 1)
 HEADER = ("1/m", "conic", "added terms", "largest coefficient, nm", "rms, nm", "maps")
 
 
@@ -39,7 +42,7 @@ class CalibrationCard:
             self._plan = ui.select(operations.PLANS, value=Calibrate.Goal.PLAN_HYSTERESIS, label="Plan").classes(
                 "w-full"
             )
-            self._maps = ui.number("Length: commands of the plan", min=0, step=10, format="%d")
+            self._maps = WholeNumberField("Length: commands of the plan", None, LENGTHS)
             self._maps.classes("w-full").props('placeholder="as configured"')
             self._maps.bind_visibility_from(self._plan, "value", value=Calibrate.Goal.PLAN_HYSTERESIS)
             self._note = ui.input("Note, stored with it").classes("w-full")
@@ -63,13 +66,8 @@ class CalibrationCard:
     def _goal(self) -> Calibrate.Goal:
         """The goal from the fields. Raises ValueError naming the field."""
         goal = Calibrate.Goal(plan=str(self._plan.value), note=str(self._note.value or ""), activate=True)
-        if goal.plan == Calibrate.Goal.PLAN_HYSTERESIS and self._maps.value is not None:
-            length = float(self._maps.value)
-            if not (length.is_integer() and 0 <= length <= 100_000):
-                raise ValueError(
-                    f"length = {length:g}: must be a whole number of commands, 0 (as configured) to 100000"
-                )
-            goal.hysteresis_maps = int(length)
+        if goal.plan == Calibrate.Goal.PLAN_HYSTERESIS and self._maps.value.strip():
+            goal.hysteresis_maps = self._maps.valid_number
         return goal
 
     def refresh(self, snapshot: Snapshot) -> None:
@@ -113,7 +111,11 @@ class CalibrationCard:
             for name, residual, remark in zip(answer.ids, answer.held_out_rms, answer.remarks, strict=True)
         }
         if options != self._choice.options:
-            self._choice.set_options(options, value=self._choice.value if self._choice.value in options else None)
+            chosen = self._choice.value
+            if chosen not in options:  # while none is in use, the newest that can be is offered
+                usable = (name for name, remark in zip(answer.ids, answer.remarks, strict=True) if not remark)
+                chosen = None if "in use" in answer.remarks else next(usable, None)
+            self._choice.set_options(options, value=chosen)
 
 
 class RecipesCard:
@@ -128,8 +130,7 @@ class RecipesCard:
             with ui.element("div").classes("line"):
                 self._first = DecimalField("First, 1/m", FIRST).classes("w-24")
                 self._last = DecimalField("Last, 1/m", LAST).classes("w-24")
-                self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
-                self._number.classes("w-20")
+                self._number = WholeNumberField("Recipes", NUMBER, NUMBERS).classes("w-20")
                 self._conic = DecimalField("Conic", 0.0).classes("w-20")
                 self._terms = ui.input("Added terms, nm").classes("w-full")
                 self._terms.props('hint="astigmatism cos=200, coma sin=-50"')
@@ -140,11 +141,9 @@ class RecipesCard:
 
     def _goal(self) -> BuildRecipes.Goal:
         """The goal from the fields. Raises ValueError naming the field that is not valid."""
-        if (conic := self._conic.number) is None:
-            raise ValueError("conic: must be a number")
         terms = terms_of(self._terms.value) if self._terms.value.strip() else []
-        curvatures = evenly(self._first.number, self._last.number, self._number.value)
-        return BuildRecipes.Goal(curvatures=curvatures, conic_constant=conic, zernike=terms)
+        curvatures = evenly(self._first.valid_number, self._last.valid_number, self._number.valid_number)
+        return BuildRecipes.Goal(curvatures=curvatures, conic_constant=self._conic.valid_number, zernike=terms)
 
     def refresh(self, snapshot: Snapshot) -> None:
         reason = reason_against("converge", snapshot, self._session.running)

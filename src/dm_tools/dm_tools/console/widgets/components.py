@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from dm_tools.console.charts.plots import Drawing
-from dm_tools.console.view_models import decimal
+from dm_tools.console.view_models import decimal, number_in, whole_number_in
 
 
 def heading(text: str, level: int = 2) -> None:
@@ -22,30 +22,79 @@ def card(title: str, folded: bool = False) -> Iterator[None]:
     with ui.element("details" if folded else "section").classes("card").props(f'aria-label="{title}"'):
         with ui.element("summary") if folded else contextlib.nullcontext():
             heading(title)
-        yield
+        # Browsers put what is folded into a box of their own, which has neither the card's grid nor its box sizing.
+        with ui.element("div").classes("unfolded") if folded else contextlib.nullcontext():
+            yield
 
 
 class DecimalField(ui.input):
     """A text field for a number with point or comma: a browser's own number field would read `0,02` as 2."""
 
-    def __init__(self, label: str, number: float, on_change: Callable[[], Any] | None = None) -> None:
+    def __init__(self, label: str, number: float | None, on_change: Callable[[], Any] | None = None) -> None:
         super().__init__(
             label,
-            value=f"{number:g}",
+            value="" if number is None else f"{number:g}",
             on_change=on_change,
-            validation={"not a number": lambda text: decimal(text) is not None},
+            validation=self._fault,
         )
         self.props('inputmode="decimal" hide-bottom-space')
+
+    def _fault(self, text: str | None) -> str | None:
+        """What is wrong with `text`, in the few words that fit under the field."""
+        return None if decimal(text) is not None else "not a number"
+
+    @property
+    def name(self) -> str:
+        """The label without its unit or explanation, as refusals name the field."""
+        return self.label.partition(",")[0].partition(":")[0].lower()
 
     @property
     def number(self) -> float | None:
         """The number in the field; None = not a number."""
         return decimal(self.value)
 
+    @property
+    def valid_number(self) -> float:
+        """The number in the field. Raises ValueError naming the field when it holds none."""
+        return number_in(self.name, self.value)
+
     def set_number(self, number: float) -> None:
         """Set the number, unless the field already holds it in another notation."""
         if self.number != number:
             self.set_value(f"{number:g}")
+
+
+class WholeNumberField(DecimalField):
+    """A text field for a whole number; a browser's own number field would move one out of range into it, in silence.
+
+    Arrow keys count up and down. A field that is empty at first may be left empty.
+
+    Attributes:
+        allowed: the range.
+    """
+
+    def __init__(
+        self, label: str, number: int | None, allowed: range, on_change: Callable[[], Any] | None = None
+    ) -> None:
+        super().__init__(label, number, on_change)
+        self.allowed, self._optional = allowed, number is None
+        self.props('inputmode="numeric"')
+        for key, step in (("up", 1), ("down", -1)):
+            self.on(f"keydown.{key}.prevent", partial(self._count, step))
+
+    def _fault(self, text: str | None) -> str | None:
+        empty = not (text or "").strip()
+        right = self._optional if empty else decimal(text) in self.allowed
+        return None if right else f"whole, {self.allowed[0]} to {self.allowed[-1]}"
+
+    @property
+    def valid_number(self) -> int:
+        """The number in the field. Raises ValueError naming field and range when it holds none of the range."""
+        return whole_number_in(self.name, self.value, self.allowed)
+
+    def _count(self, step: int) -> None:
+        if (number := self.number) is not None and number + step in self.allowed:
+            self.set_number(number + step)
 
 
 class ActionButton(ui.element):

@@ -62,10 +62,8 @@ class FocusCard:
             self._typing = False
 
     def _request(self) -> FocusRequest:
-        """The request in the fields. Raises ValueError when one is not a number."""
-        curvature, conic_constant = self._number.number, self._conic.number
-        if curvature is None or conic_constant is None:
-            raise ValueError("curvature and conic constant must be numbers")
+        """The request in the fields. Raises ValueError naming the one that is not a number."""
+        curvature, conic_constant = self._number.valid_number, self._conic.valid_number
         return FocusRequest(curvature=curvature, conic_constant=conic_constant, mode=str(self._mode.value))
 
     def refresh(self, snapshot: Snapshot) -> None:
@@ -79,7 +77,14 @@ class FocusCard:
         self._take_range(snapshot)
         value = self._number.number
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
-        inputs = (value, self._conic.number, self._mode.value, *self._prediction_basis(snapshot))
+        # What is no number counts as typed: the refusal names it.
+        fields = [field.value if field.number is None else field.number for field in (self._number, self._conic)]
+        inputs = (*fields, self._mode.value, *self._prediction_basis(snapshot))
+        if against := reason_against("focus", snapshot, ""):
+            self._prediction.classes(remove="refused")
+            self._prediction.show(f"No prediction. {against}")
+            self._inputs = ()  # one is made as soon as that has passed
+            return
         if inputs[:3] != self._predicted:
             self._prediction.show("")
         if inputs != self._inputs:
@@ -118,6 +123,7 @@ class FocusCard:
             # Set as numbers: values that `props()` parses from a string stay strings, and the slider ignores the mouse.
             self._slider.props["min"] = round(math.ceil(found[0] / STEP) * STEP, 4)
             self._slider.props["max"] = round(math.floor(found[1] / STEP) * STEP, 4)
+            self._typed()  # the slider could not follow before
 
     async def _predict(self) -> None:
         try:
