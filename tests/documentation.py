@@ -168,6 +168,7 @@ PARSED = {
     "./dm calibrate --hysteresis 200": _LONG + "test_calibration_node.py and the demo run the plan",
     "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
     "./dm calibrate --plan poke-check": _LONG + "test_whole_runs.py runs the plan",
+    "./dm focus 0.02 --conditioned": "needs recipes; test_focus_hysteresis.py asks for it",
     "./dm recipes": _LONG + "test_loop_actions.py runs the action",
     "./dm recipes --curvatures=-0.02,0,0.02": "needs a hysteresis plan first; test_loop_actions.py runs the action",
     "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a hysteresis plan first",

@@ -72,8 +72,12 @@ def _number(value: float) -> float | None:
 
 
 def figures_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over all mirrors that do not change after calibration; `worst_in_ten` = 90 % quantile over mirrors."""
-    kept = [row for row in rows if "any_order" in row and not row["changes"]]
+    """Figures over all mirrors that do not change after calibration; `worst_in_ten` = 90 % quantile over mirrors.
+
+    `without_errors`: mirrors that were not calibrated or refused every request, and are in none of these quantiles.
+    """
+    same = [row for row in rows if not row["changes"]]
+    kept = [row for row in same if "any_order" in row]
     if not kept:
         return {}
 
@@ -88,6 +92,7 @@ def figures_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     worst = max(kept, key=lambda row: row["any_order"]["p90_nm"] or 0.0)
     return {
         "mirrors": len(kept),
+        "without_errors": sum(not row.get("any_order", {}).get("requests") for row in same),
         "median_mirror": {name: over("any_order", name, 0.5) for name in ("p50_nm", "p90_nm", "max_nm")},
         "worst_in_ten": {name: over("any_order", name, 0.9) for name in ("p50_nm", "p90_nm", "max_nm")},
         "recipes_p90_nm": {
@@ -163,6 +168,8 @@ def _show_population(figures: dict[str, Any]) -> None:
     lowest = ", ".join(
         f"{group.replace('_', ' ')} {_text(value, '.0%')}" for group, value in figures["lowest_coverage"].items()
     )
+    if lost := figures["without_errors"]:
+        console.print(f"not calibrated, or every request refused: {lost}, not in these quantiles")
     console.print(
         f"{figures['mirrors']} mirrors; bound holds for 90 % or more of the requests on "
         f"{figures['covered_90_to_100']:.0%} of them; lowest coverage: {lowest}; refused inside the published range: "

@@ -83,7 +83,10 @@ def test_a_mirror_that_cannot_be_driven_fails_by_itself(
 def test_figures_without_any_request_are_shown_as_none(capsys: pytest.CaptureFixture[str]) -> None:
     outcome = Outcome(draw_mirror(3), groups={name: Requests.none(["refused"]) for name in (ANY_ORDER, RECIPES)})
     show([row_of(outcome)])
-    assert "median mirror: p50 -, p90 -, recipes p90 -" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "median mirror: p50 -, p90 -, recipes p90 -" in shown
+    assert "every request refused: 1, not in these quantiles" in shown
+    assert "1 mirrors; bound holds for 90 % or more of the requests on 0% of them" in shown
 
 
 def test_mirrors_need_one_first_seed() -> None:

@@ -77,6 +77,13 @@ def test_without_a_terminal_each_map_is_a_line(capsys: pytest.CaptureFixture[str
     assert lines == [f"recipe 1: +0.0200 1/m, map {step}: largest coefficient 4.0 nm" for step in (1, 2)]
 
 
+def test_the_duration_is_told_beforehand(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {"converge.settle_time": 0.5, "recipes.average": 8, "map_time": 0.3}
+    monkeypatch.setattr(recipes, "get_parameter", lambda _client, _node, name: told[name])
+    client = SimpleNamespace(capabilities=Capabilities(condition_time=4.4))
+    assert recipes.expected_run(client, 4) == "4 recipes in about 58 s if a map takes 0.3 s"
+
+
 def test_added_terms_go_by_the_names_that_measure_prints() -> None:
     terms = dict(zip(SPOKEN, terms_of("astigmatism cos=200, coma sin=−50"), strict=True))
     assert {name: value for name, value in terms.items() if value} == pytest.approx(
@@ -103,6 +110,22 @@ def test_a_list_builds_nothing(words: tuple[str, ...]) -> None:
         (RecipeBook(calibration_id="a"), "./dm recipes"),
         (RecipeBook(calibration_id="a", degauss_steps=100), "./dm check"),
         (RecipeBook(calibration_id="a", degauss_steps=100, recipes=[Recipe()]), "mode: conditioned"),
+        (
+            RecipeBook(calibration_id="a", degauss_steps=100, recipes=[Recipe(curvature=-0.02)]),
+            "./dm focus -0.02 --conditioned",
+        ),
+        (
+            RecipeBook(
+                calibration_id="a",
+                degauss_steps=100,
+                recipes=[Recipe(conic_constant=-1.0), Recipe(zernike=[0.0, 1e-7]), Recipe(curvature=0.03)],
+            ),
+            "./dm focus 0.03 --conditioned",
+        ),
+        (
+            RecipeBook(calibration_id="a", degauss_steps=100, recipes=[Recipe(curvature=0.02, conic_constant=-1.0)]),
+            "requests of these shapes with `mode: conditioned`",
+        ),
     ],
 )
 def test_what_to_do_next_goes_by_what_there_is(book: RecipeBook, advice: str) -> None:
