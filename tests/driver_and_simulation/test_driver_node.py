@@ -376,7 +376,7 @@ def test_a_signal_ramps_to_the_safe_shape(
 
 def test_the_mirror_is_described_again_when_another_driver_of_this_name_has_ended(driver: Driver) -> None:
     node = driver.observer.node
-    wait_until(lambda: driver.infos, what="the driver's own description")
+    wait_until(lambda: driver.infos, what="the driver's own description")  # it would come after the other otherwise
     other = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
     wait_until(lambda: other.get_subscription_count() > 0)
     other.publish(MirrorInfo(serial="another"))

@@ -64,9 +64,11 @@ def test_a_curvature_becomes_the_right_command(bench: Bench) -> None:
 def test_topic_requests_are_answered_on_focus_state(bench: Bench) -> None:
     bench.ready()
     wait_until(lambda: bench.request.get_subscription_count() > 0)
-    bench.request.publish(FocusRequest(curvature=-0.01))
+    request = FocusRequest(curvature=-0.01)
+    request.header.stamp = bench.observer.node.get_clock().now().to_msg()
+    bench.request.publish(request)
     state = wait_until(lambda: bench.focus_states and bench.focus_states[-1])
-    assert state.error_code == ErrorCode.OK
+    assert (state.error_code, state.request_stamp) == (ErrorCode.OK, request.header.stamp)
     command = wait_until(lambda: bench.commands and bench.commands[-1])
     assert state.header.stamp == command.header.stamp
 
@@ -94,7 +96,7 @@ def test_dry_run_and_refusals_move_nothing(bench: Bench) -> None:
     old = FocusRequest(curvature=0.01)
     old.header.stamp = Time(seconds=1000).to_msg()
     stale = bench.observer.call(SetFocus, "set_focus", SetFocus.Request(request=old))
-    assert stale.error_code == ErrorCode.STALE
+    assert (stale.error_code, stale.state.request_stamp) == (ErrorCode.STALE, old.header.stamp)
     assert bench.commands == []
 
 

@@ -35,7 +35,7 @@ def state_message(order: Order, values: Mapping[str, Any], share: HysteresisShar
     state.curvature, state.power = request.curvature, 2 * request.curvature
     state.conic_constant, state.zernike = request.conic_constant, request.zernike
     state.mode, state.applied = request.mode, order.applied
-    state.header.stamp = time_message(order.began.ns)
+    state.header.stamp, state.request_stamp = time_message(order.began.ns), request.header.stamp
     if move is not None and active is not None:
         plan = move.plan
         drift, drift_rms = (0.0, 0.0) if order.creep_held else move.drift
