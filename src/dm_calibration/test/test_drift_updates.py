@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from dm_msgs.msg import Capabilities, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from rclpy.exceptions import InvalidHandle
 
 from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
@@ -936,6 +937,22 @@ def test_an_update_that_the_disk_does_not_take_is_a_warning(monkeypatch: pytest.
     listener._worker.shutdown()
     assert told == ["map not used: the update of x was not stored in y: No space left on device"]
     assert listener._last_refusal.endswith("No space left on device")
+
+
+@pytest.mark.parametrize("running", [True, False])
+def test_a_map_that_comes_while_the_process_ends_is_no_error(running: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = list[str]()
+    listener = silent_listener(monkeypatch, SimpleNamespace(error=told.append))
+    listener._node.context = SimpleNamespace(ok=lambda: running)
+
+    def gone(*_arguments: object) -> None:
+        raise InvalidHandle("destruction was requested")
+
+    listener._updates.take, listener.history = gone, SimpleNamespace(heard_since=lambda _at: True, settled=lambda *_: 0)
+    hear(listener, 1)
+    listener._worker.shutdown()
+    assert told == ["map not used: InvalidHandle: destruction was requested"] * running
+    assert listener._refused == 1
 
 
 def test_a_wide_gap_of_a_mirror_that_is_well_is_no_surprise(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:

@@ -189,7 +189,8 @@ class MapListener:
             log.info(f"map not used: {error}", throttle_duration_sec=10.0)
         except Exception as error:  # no map may keep the next one from being taken
             self._refuse(f"{type(error).__name__}: {error}")
-            log.error(f"map not used: {type(error).__name__}: {error}")
+            if self._node.context.ok():  # while the process ends, all that this uses is gone
+                log.error(f"map not used: {self._last_refusal}")
 
     def _compare(self, measured: Measurement, arrived: float, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
         """Compare a map with the calibration, and update it if they agree; `_turn` must be held.
@@ -202,8 +203,7 @@ class MapListener:
             MapNotUsableError, StoreError: see :meth:`RecalibrationManager.take`.
         """
         self._compared.append(measured)
-        still = self._values["updates.still_time"]
-        at = 1e-9 * measured.stamp_ns
+        still, at = self._values["updates.still_time"], 1e-9 * measured.stamp_ns
         measured = replace(measured, temperature=self._temperatures.at(at))
         wait_s = arrived + REPORT_WAIT_S + still - time.monotonic()
         if not wait_until(lambda: self.history.heard_since(at + still), wait_s):
