@@ -14,9 +14,9 @@ from dm_calibration.procedure.forecast import (
     TYPICAL_DEGAUSS_S,
     Forecast,
     GoodEnough,
-    error_after_one_map,
     expected_end,
     forecast,
+    law_error,
 )
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, Step, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -66,15 +66,18 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
         .accuracy(2e-9)
         .startswith(", not expected to reach 2 nm: moves then accurate to 2.04 nm (")
     )
-    short = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=100))
-    assert forecast(short, 0.5, None, mirror).max_zernike == pytest.approx(2.6e-9, rel=0.1)
+    fewer = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=120))
+    assert forecast(fewer, 0.5, None, mirror).max_zernike == pytest.approx(2.4e-9, rel=0.1)
+    # As the run then promises: held-out moves show too little of own laws from few maps. 2.9 nm was told, 93 promised.
+    few = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=80))
+    assert forecast(few, 0.5, None, mirror).max_zernike == pytest.approx(2.9e-9 * (85 / 53) ** 3, rel=0.1)
 
 
 def test_what_is_left_follows_from_what_is_reached() -> None:
     mirror = make_mirror()
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
     first, *ends = sorted(plan.ends)
-    law = error_after_one_map(None, mirror)
+    law = law_error(None, mirror)
     end, expected = expected_end(plan, first - 1, 3e-9, 2e-9, law)
     assert end in ends and 1.7e-9 < expected <= 2e-9
     assert all(expected_end(plan, first - 1, 3e-9, 3e-9 * (first / other) ** 0.5, law)[0] == other for other in ends)
@@ -86,10 +89,11 @@ def test_before_the_law_is_found_nothing_is_expected() -> None:
     """11 nm after 89 maps of the shipped bench told 4.8 nm after 344 more; after 41 more it had 1.7 nm."""
     mirror = make_mirror(rings=3)
     plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=420, until=2e-9))
-    law = error_after_one_map(None, mirror)
+    law = law_error(None, mirror)
     assert expected_end(plan, 89, 11e-9, 2e-9, law) == (len(plan.steps), 0.0)
     assert expected_end(plan, 130, 2.5e-9, 2e-9, law)[1] == pytest.approx(2e-9, rel=0.1)
-    assert expected_end(plan, 130, 2.5e-9, 2e-9, 0.3 * law)[1] == 0.0  # an earlier calibration was better
+    better = replace(law, first=0.3 * law.first)  # an earlier calibration was better
+    assert expected_end(plan, 130, 2.5e-9, 2e-9, better)[1] == 0.0
 
 
 @pytest.mark.parametrize(("rings", "maps"), [(0, 300), (6, 420)])

@@ -15,7 +15,7 @@ from dm_calibration.hysteresis.excitation import fewest_maps
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import GoodEnough, error_after_one_map, expected_end, forecast, step_times
+from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, law_error, step_times
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
@@ -216,7 +216,7 @@ class CalibrateAction:
         """Report the error `reached` (m) after `maps` maps, and estimate the remaining steps."""
         feedback = self._feedback
         feedback.reached_max_zernike = reached
-        law = error_after_one_map(self._manager.in_use, self._mirror)
+        law = law_error(self._manager.in_use, self._mirror)
         step, until = feedback.step, self._goal.until
         self._end, feedback.expected_max_zernike = expected_end(self._plan, step, reached, until, law)
         self._node.get_logger().info(f"{maps} maps: accurate to {reached * 1e9:.2f} nm")

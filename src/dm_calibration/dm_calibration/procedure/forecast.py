@@ -1,12 +1,12 @@
 """Duration and accuracy of a hysteresis plan, estimated before anything moves."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
+from dm_calibration.hysteresis.hysteresis_fit import few_maps, fit_hysteresis
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
@@ -19,9 +19,9 @@ from dm_common.mirror import Mirror
 STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
-#: Error of moves after a run of one map per actuator, for a mirror never calibrated, m; it falls with the root of the
-#: number of maps. Median of 29 mirrors drawn at random (seeds 7646 to 7675 without 7650): 1.5 nm after 314 maps. One
-#: mirror in ten reached only 3.0 nm.
+#: Error of moves after a run of one map per actuator, for a mirror never calibrated, m, as in :attr:`LawError.first`.
+#: Median of 29 mirrors drawn at random (seeds 7646 to 7675 without 7650): 1.5 nm after 314 maps. One mirror in ten
+#: reached only 3.0 nm.
 TYPICAL_LAW = 4.5e-9
 #: If the error in a run exceeds the typical one by more than this factor, the law has probably not been found yet.
 WORST_LAW = 2.2
@@ -58,6 +58,23 @@ class Forecast:
         return f",{missed} {right}"
 
 
+@dataclass(frozen=True)
+class LawError:
+    """Error of moves by the number of maps, as `HysteresisFit.held_out_max_zernike`.
+
+    Attributes:
+        first: m, after one map, if the factor for few maps is left out; it falls with the root of their number.
+        own: number of actuators with laws of their own, for that factor; 0 = one law for all.
+    """
+
+    first: float
+    own: int
+
+    def after(self, maps: int) -> float:
+        """m, after `maps` maps."""
+        return float(self.first * few_maps(maps, self.own) / np.sqrt(maps))
+
+
 def forecast(
     plan: Plan,
     settle_time: float,
@@ -89,9 +106,9 @@ def forecast(
     typical = earlier is None or earlier.hysteresis is None
     if not tested or (typical and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
         return expected
-    law = error_after_one_map(earlier, mirror)
+    law = law_error(earlier, mirror)
     for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):
-        expected = Forecast(float(time[part - 1]), float(law / np.sqrt(part)), part, typical)
+        expected = Forecast(float(time[part - 1]), law.after(part), part, typical)
         if expected.max_zernike <= until:
             break
     return expected
@@ -107,28 +124,26 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     )
 
 
-def error_after_one_map(earlier: Calibration | None, mirror: Mirror) -> float:
-    """Error of moves after one map, m, extrapolated from the `earlier` calibration of `mirror` or from typical mirrors.
-
-    The error is inversely proportional to the root of the number of maps.
-    """
-    if earlier is not None and earlier.hysteresis is not None:
-        return float(earlier.hysteresis.held_out_max_zernike * np.sqrt(earlier.hysteresis.maps))
-    return float(TYPICAL_LAW * np.sqrt(mirror.actuators))
+def law_error(earlier: Calibration | None, mirror: Mirror) -> LawError:
+    """How the error falls, by the `earlier` calibration of `mirror`, or as for typical mirrors."""
+    if earlier is None or earlier.hysteresis is None:
+        return LawError(float(TYPICAL_LAW * np.sqrt(mirror.actuators)), mirror.actuators)
+    found, falls = earlier.hysteresis, LawError(1.0, earlier.hysteresis.law.actuators)
+    return replace(falls, first=found.held_out_max_zernike / falls.after(found.maps))
 
 
-def expected_end(plan: Plan, done: int, reached: float, until: float, law: float) -> tuple[int, float]:
+def expected_end(plan: Plan, done: int, reached: float, until: float, law: LawError) -> tuple[int, float]:
     """The number of steps of `plan` after which the error `until` (m) is expected, or all, and the error expected then.
 
     The error falls suddenly when the law is found, at a time that cannot be predicted; before, the expected error is 0
-    (not known). From then on it is inversely proportional to the root of the number of maps.
+    (not known). From then on it is inversely proportional to the root of the number of maps: `reached` may be that of a
+    law common to all actuators, without a factor for few maps.
 
     Args:
         done: steps so far.
         reached: error after these, m.
-        law: m, see `error_after_one_map`.
     """
-    if reached > WORST_LAW * law / np.sqrt(done):
+    if reached > WORST_LAW * law.first / np.sqrt(done):
         return len(plan.steps), 0.0
     ends = [*(end for end in sorted(plan.ends) if end > done + 1), len(plan.steps)]
     expected = [reached * np.sqrt(done / end) for end in ends]
