@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisObserver, HysteresisTracker
 from dm_common.mirror import Applied
 from example_hysteresis import rich
 
@@ -75,6 +75,31 @@ def test_a_degauss_cures(tracker: HysteresisTracker) -> None:
     tracker.observe(report(9.0, REST, 10, REST, degausses=2))
     assert not tracker.unknown and tracker.state is not None
     np.testing.assert_array_equal(tracker.state.play, LAW.demagnetised(2, 9.0).play)
+
+
+def test_a_move_after_a_degauss_of_which_the_end_was_not_seen_is_not_known(tracker: HysteresisTracker) -> None:
+    """The degauss may end in any shape: here it ended in B, then the mirror went to A."""
+    tracker.observe(report(3.0, C, 1, REST, moving=True, history_known=False, requested=B))
+    tracker.observe(report(9.0, A, 3, A, degausses=2))
+    assert "after the degauss" in tracker.unknown
+
+
+@pytest.mark.parametrize("follow_later", [False, True])
+def test_a_driver_that_knows_no_signals_yet_begins_its_counts_anew(follow_later: bool) -> None:
+    """No report of it is heard after that before its counts have passed those of the driver before it."""
+    observer = HysteresisObserver()
+    if not follow_later:
+        observer.use(LAW, 0.0)
+    observer.observe(report(0.0, REST, degausses=0, history_known=False, heard=0.0))
+    observer.observe(report(1.0, REST, 1, REST, heard=600.0))
+    for heard in (700.0, 701.0):
+        nothing = report(0.0, np.zeros(0), degausses=0, history_known=False, active=False, heard=heard)
+        observer.observe(nothing)
+    observer.observe(report(3600.0, A, 2, B, heard=3600.0))
+    observer.use(LAW, 0.0)
+    assert observer.unknown
+    observer.observe(report(3610.0, REST, 3, REST, degausses=2, heard=3610.0))
+    assert not observer.unknown
 
 
 def test_creep_before_a_degauss_is_kept_if_no_swing_was_seen(tracker: HysteresisTracker) -> None:

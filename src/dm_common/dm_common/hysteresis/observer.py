@@ -103,14 +103,13 @@ class HysteresisTracker:
         self.state = self.law.move(self.state, report.signals, report.time)
 
     def _degaussed(self, report: Applied, last: Applied) -> None:
-        """Begin a new history; moves since the degauss are known if there was at most one turn."""
+        """Begin a new history; moves since the degauss are known if there was no turn after it."""
         assert self.state is not None
         # During the swings about the middle, creep follows the middle; if none was seen, from the last report onwards.
         unseen = self.law.advance(self.state, min(self._seen, report.time))
         began, self._set_off = (self._set_off if last.moving else None) or unseen, None
         self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
-        # The end of the degauss counts as a turn, and so does a move that was abandoned for it.
-        seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
+        seen = report.turns - last.turns <= 1 and report.degausses == last.degausses + 1
         self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"
         self._follow(report, last)
 
@@ -216,6 +215,10 @@ class HysteresisObserver:
             self.latest = report
             if report.signals.size:
                 self._take(report)
+            elif self._log:  # another driver, or another activation: its counts begin anew
+                held = self._log[-1]
+                time = max(held.time, held.heard)
+                self._take(replace(report, signals=held.signals, time=time, heard=held.heard, linked=False))
             if doubtful:
                 self._doubtful.append((max(report.heard, report.time), doubtful))
                 self._widen(*self._doubtful[-1])
