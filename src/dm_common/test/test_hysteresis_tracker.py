@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_common.hysteresis.creep_record import UNSEEN
 from dm_common.hysteresis.observer import HysteresisObserver, HysteresisTracker
 from dm_common.mirror import Applied
 from example_hysteresis import rich
@@ -84,6 +85,48 @@ def test_a_move_after_a_degauss_of_which_the_end_was_not_seen_is_not_known(track
     assert "after the degauss" in tracker.unknown
 
 
+@pytest.mark.parametrize(
+    "later",
+    [
+        report(3600.0, C, 4, B),
+        report(3600.0, C, 2, B),
+        report(3600.0, C, 2, B, history_known=False, moving=True),
+        report(3600.0, C, 4, B, degausses=2),
+    ],
+)
+def test_how_long_a_shape_was_held_that_no_report_showed_is_not_known(
+    tracker: HysteresisTracker, later: Applied
+) -> None:
+    """The link to the driver is lost for an hour, in which another program uses the mirror."""
+    tracker.observe(later)
+    assert tracker.state is not None
+    minutes = LAW.creep_time < 600.0
+    assert tracker.state.crept_sigma[minutes] == pytest.approx(UNSEEN, rel=0.01)
+
+
+def test_a_clock_that_jumps_in_a_degauss_leaves_creep_in_doubt() -> None:
+    observer = HysteresisObserver()
+    observer.use(LAW, 0.0)
+    observer.observe(report(0.0, A, heard=0.0))
+    observer.observe(report(9.0, REST, moving=True, history_known=False, heard=9.0))
+    observer.observe(report(3610.0, B, moving=True, history_known=False, heard=3610.0), doubtful=3600.0)
+    observer.observe(report(3612.0, REST, 1, REST, degausses=2, heard=3612.0))
+    assert observer.state is not None and not observer.unknown
+    assert observer.state.crept_sigma[np.searchsorted(LAW.creep_time, 300.0)] > 0.9 * UNSEEN
+
+
+def test_time_passes_once_if_a_clock_that_ran_ahead_is_set_back_by_less() -> None:
+    """The next report may still have the stamp of a write of before both."""
+    observer = HysteresisObserver()
+    observer.use(LAW, 0.0)
+    observer.observe(report(0.0, A, heard=10.0))
+    observer.observe(report(0.0, A, heard=7210.0), doubtful=7200.0)
+    observer.observe(report(0.0, A, history_known=False, heard=3620.0))
+    observer.observe(report(3620.0, B, history_known=False, heard=3620.0))
+    assert observer.state is not None
+    assert observer.state.crept_sigma[np.searchsorted(LAW.creep_time, 300.0)] > 0.9 * UNSEEN
+
+
 @pytest.mark.parametrize("follow_later", [False, True])
 def test_a_driver_that_knows_no_signals_yet_begins_its_counts_anew(follow_later: bool) -> None:
     """No report of it is heard after that before its counts have passed those of the driver before it."""
@@ -97,7 +140,8 @@ def test_a_driver_that_knows_no_signals_yet_begins_its_counts_anew(follow_later:
         observer.observe(nothing)
     observer.observe(report(3600.0, A, 2, B, heard=3600.0))
     observer.use(LAW, 0.0)
-    assert observer.unknown
+    assert observer.unknown and observer.state is not None
+    assert observer.state.crept_sigma[np.searchsorted(LAW.creep_time, 300.0)] == pytest.approx(UNSEEN, rel=0.01)
     observer.observe(report(3610.0, REST, 3, REST, degausses=2, heard=3610.0))
     assert not observer.unknown
 

@@ -71,54 +71,53 @@ class HysteresisTracker:
             self.state, self._set_off = replace(state, crept=crept, crept_sigma=0.0 * state.crept_sigma), None
         if report.time < last.time or max(report.time, report.heard) < self.state.time:
             # Hysteresis does not depend on time; creep pauses until the clock has caught up.
-            self.state = replace(self.state, time=report.time)
+            self.state = replace(self.state, time=max(report.time, report.heard))
         if report.turns < last.turns or report.degausses < last.degausses:
             # Best guess: since the driver was last heard, the mirror has stood at the signals that it reports now.
             self.state = self.law.move(self.state, report.signals, min(self._seen, report.time))
-            self._guess_keeping_creep(report, "the driver was started or activated again", self._seen)
+            self.unknown = "the driver was started or activated again"
+            self._follow(report, last, self._seen)
             return
+        turns = report.turns - last.turns
+        # Of a shape that was left again before it was reported, nobody knows how long it was held.
+        at = report.signals if report.turned_at is None else report.turned_at
+        left = turns > 1 or (turns == 1 and not np.array_equal(report.signals, at))
+        # Without a link it is not known whether the outputs held: the unit may have lost power.
+        since = self._seen if left or (report.linked and not last.linked) else report.time
         if report.degausses > last.degausses:
-            self._degaussed(report, last)
+            self._degaussed(report, last, since)
             return
         # A move begins with its first write, whose stamp gives the time; until then the earlier shape is held.
         unwritten = self._set_off is not None and np.array_equal(last.signals, self._set_off.signals)
-        if report.moving and (not last.moving or report.turns > last.turns or unwritten):
+        if report.moving and (not last.moving or turns or unwritten):
             self._set_off = self.law.advance(self.state, report.time)
         if not report.history_known:
-            # Without a link it is not known whether the outputs held: the unit may have lost power.
-            since = self._seen if report.linked and not last.linked else report.time
-            reason = "writes were lost, or a degauss was interrupted, too short or too small"
-            self._guess_keeping_creep(report, self.unknown or reason, since)
-            return
-        if (missed := report.turns - last.turns - 1) > 0:
-            reason = f"{missed} turns were not seen" if missed > 1 else "a turn was not seen"
-            self._guess_keeping_creep(report, self.unknown or reason, report.time)
-        else:
-            self._follow(report, last)
+            self.unknown = self.unknown or "writes were lost, or a degauss was interrupted, too short or too small"
+        elif turns > 1:
+            self.unknown = self.unknown or (f"{turns - 1} turns were not seen" if turns > 2 else "a turn was not seen")
+        self._follow(report, last, since)
 
-    def _follow(self, report: Applied, last: Applied) -> None:
+    def _follow(self, report: Applied, last: Applied, since: float) -> None:
+        """Move to the signals reported, by the last turn; shapes held since `since` (s) are not known."""
         assert self.state is not None
         if report.turns > last.turns and report.turned_at is not None:
             self.state = self.law.move(self.state, report.turned_at, report.time)
-        self.state = self.law.move(self.state, report.signals, report.time)
+        state = self.law.move(self.state, report.signals, report.time)
+        self.state = replace(state, crept_sigma=held_unseen(self.law, state.crept_sigma, report.time - since))
 
-    def _degaussed(self, report: Applied, last: Applied) -> None:
+    def _degaussed(self, report: Applied, last: Applied, since: float) -> None:
         """Begin a new history; moves since the degauss are known if there was no turn after it."""
         assert self.state is not None
         # During the swings about the middle, creep follows the middle; if none was seen, from the last report onwards.
         unseen = self.law.advance(self.state, min(self._seen, report.time))
         began, self._set_off = (self._set_off if last.moving else None) or unseen, None
-        self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
+        state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
+        # The clock may have jumped since it began.
+        doubt = self.law.advance(self.state, report.time).crept_sigma
+        self.state = replace(state, crept_sigma=np.maximum(state.crept_sigma, doubt))
         seen = report.turns - last.turns <= 1 and report.degausses == last.degausses + 1
         self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"
-        self._follow(report, last)
-
-    def _guess_keeping_creep(self, report: Applied, reason: str, since: float) -> None:
-        """The position is known, but neither the branch of the loop nor the shapes held since `since` (s)."""
-        assert self.state is not None
-        state = self.law.move(self.state, report.signals, report.time)
-        sigma = held_unseen(self.law, state.crept_sigma, report.time - since)
-        self.state, self.unknown = replace(state, crept_sigma=sigma), reason
+        self._follow(report, last, since)
 
 
 class ActuatorEstimate(NamedTuple):
