@@ -69,7 +69,8 @@ def test_an_influence_function(store: CalibrationStore) -> None:
 
 def test_what_later_maps_changed(store: CalibrationStore) -> None:
     calibration, message = published(store, "linear")
-    manager = RecalibrationManager(store.folder, lambda: UpdateOptions(signal_sigma=1e-3))
+    options = UpdateOptions(signal_sigma=1e-3, gain_rate=0.0, figure_rate=0.0)
+    manager = RecalibrationManager(store.folder, lambda: options)
     assert manager.begin(calibration) == ""
     kept = manager.in_use
     assert kept is not None

@@ -146,6 +146,16 @@ class Drift:
         failing = np.where(weak, effective, np.where(new, np.nan, self.failing))
         return replace(self, stuck=stuck, failing=failing, disagreement=max(self.disagreement, error))
 
+    def at_half(self, gain: Floats) -> Floats:
+        """(K, N + R) effect of gain and offset on K reduced values, each at half of what it alone can reach.
+
+        Args:
+            gain: (K, N) per unit of effective signal.
+        """
+        alone = np.linalg.pinv(gain).T  # signals of each value alone
+        half = 0.5 * alone / np.maximum(np.abs(alone).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return np.hstack((gain * half * np.isnan(self.stuck), np.eye(len(gain), len(self.offset))))
+
     @property
     def given_up(self) -> str:
         """Sentence on the actuators that no longer move and where they stand; "" = all move."""

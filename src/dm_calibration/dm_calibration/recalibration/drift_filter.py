@@ -88,7 +88,7 @@ class DriftFilter:
 
     def __init__(self, calibration: Calibration, options: UpdateOptions) -> None:
         fit, maps, hysteresis = calibration.fit, calibration.maps, calibration.hysteresis
-        self._fit, self.options = fit, options
+        self._fit, self.options, self._began_ns = fit, options, calibration.stamp_ns
         self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
         self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
         self._visible = visible_gain(self._gain, self.reduction, calibration)
@@ -254,14 +254,17 @@ class DriftFilter:
         return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
 
     def drift_error(self, drift: Drift, elapsed: float) -> float:
-        """95 % bound of the coefficient error, m, by drift in `elapsed` s, at half of what a term alone can reach."""
-        count = self.reduction.coefficients
-        gain, alone = self._gain[:count], np.linalg.pinv(self._gain[:count]).T  # signals of each term alone
-        half = 0.5 * alone / np.maximum(np.abs(alone).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        moved = np.hstack((gain * half, np.eye(count, self.reduction.size)))
-        growth = drift.excess**2 * elapsed / DAY_S * self._growth[: moved.shape[1], : moved.shape[1]]
-        size = np.sqrt(np.einsum("ki,ij,kj->k", moved, growth, moved))
-        return LARGEST_95 * float((size / TERM_RMS[PISTON_TILT : PISTON_TILT + count]).max())
+        """95 % bound of the coefficient error, m, at half of what a term alone can reach, by drift since the last map,
+        `elapsed` s ago, and by earlier drift that maps leave open, or show but have not confirmed.
+        """
+        moved = drift.at_half(self._gain[: self.reduction.coefficients])
+        # What was uncertain when it was calibrated is part of every bound.
+        parts = np.stack((drift.covariance - self.start(0).covariance, drift.excess**2 / DAY_S * self._growth))
+        left, growth = np.einsum("ki,mij,kj->mk", moved, parts[:, : moved.shape[1], : moved.shape[1]], moved)
+        unused = np.square((1.0 - drift.trust) * moved @ np.concatenate((drift.gain, drift.offset)))
+        earlier = growth * max(0.0, 1e-9 * (drift.stamp_ns - self._began_ns))
+        size = np.sqrt(np.clip(left + np.minimum(unused, earlier), 0.0, earlier) + growth * elapsed)
+        return LARGEST_95 * float((size / TERM_RMS[PISTON_TILT:][: len(size)]).max())
 
     def stuck_error(self, drift: Drift) -> float:
         """Bound of the coefficient error by stuck actuators that creep on, m; 0 without a law of creep."""
@@ -272,10 +275,7 @@ class DriftFilter:
         return STUCK_DECADES * self._creep_law.creep_rate * np.nan_to_num(1.0 + np.abs(drift.stuck))
 
     def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:
-        """The influence function with gains and figure changed by the confirmed part of `drift`.
-
-        Stuck actuators have no influence: their constant effect is part of the figure.
-        """
+        """The fit changed by the confirmed part of `drift`; stuck actuators only change the figure."""
         fit, moves = self._fit, np.isnan(drift.stuck)
         warmer = drift.thermal_trust * drift.warmer(temperature)
         coefficients, sag = self.reduction.expand(drift.trust * drift.figure + warmer * drift.thermal[1:])
