@@ -568,7 +568,9 @@ def test_of_another_bench_the_wiring_comes_first() -> None:
     assert verb_status._next([], "", active, None, None, none).startswith("./dm calibrate --plan poke-check --config ")
     assert verb_status._next([], "", active, None, None, none, simulated=True) == "./dm calibrate"
     lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST)
-    assert "must reach the electronics first" in verb_status._next([], "", lost, used, None, refused)
+    for simulated, doctor in ((False, ": ./dm doctor --config FILE says"), (True, ": ./dm doctor says")):
+        told = verb_status._next([], "", lost, used, None, refused, simulated)
+        assert "must reach the electronics first" in told and doctor in told
 
 
 @pytest.mark.parametrize(("predicted", "next_step"), [(19e-9, "./dm check"), (21e-9, "ask for the shape again: ")])

@@ -150,12 +150,13 @@ def _next(
 ) -> str:
     if lacking:
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
+    doctor = f"./dm doctor{'' if simulated else ' --config FILE'}"
     if state is not None and state.driver_state == state.STATE_LINK_LOST:
-        return "the driver must reach the electronics first: ./dm doctor --config FILE says what is wrong"
+        return f"the driver must reach the electronics first: {doctor} says what is wrong"
     if state is None or state.driver_state != state.STATE_ACTIVE:
         resting = state is not None and state.driver_state == state.STATE_INACTIVE
         first = "`ros2 lifecycle set /pdm_driver activate`; " if resting else ""
-        return f"the driver must be active first: {first}./dm doctor --config FILE says what it lacks"
+        return f"the driver must be active first: {first}{doctor} says what it lacks"
     if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
         return str(capabilities.message)
     if by:
