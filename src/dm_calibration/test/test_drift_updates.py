@@ -327,6 +327,22 @@ def test_one_that_is_given_up_and_may_only_be_weakened_keeps_bounds_wide_until_a
     assert (promise(updates) < 10e-9) != weak and ("weakened" in updates.doubts[0]) == weak
 
 
+@pytest.mark.parametrize("share, signal", [(0.25, -0.09), (0.5, 0.07), (0.05, 0.7), (0.0, 0.09)])
+def test_one_that_is_given_up_near_mid_range_counts_as_weakened_until_a_map_shows_it_at_the_same_place(
+    bench: SteadyMirror, made: Made, tmp_path: Path, share: float, signal: float
+) -> None:
+    """Of a patch at 25 %, given up in a shape that asked little of it, 9 nm were told and 227 made."""
+    updates, settled, wanted = begun(made, tmp_path), bench.settled(), bench.signals.copy()
+    for name, at in (("given up", signal), ("hardly another shape", 1.1 * signal), ("another", -0.6)):
+        wanted[6] = at
+        bench.apply(np.where(np.arange(wanted.size) == 6, share * wanted, wanted))
+        without = [6] if name == "given up" else []
+        updates.take(bench.measure(name), replace(settled, effective=wanted), without=without)
+        assert error(bench, changed_fit(updates)) < 2.0 * promise(updates), name
+        assert ("if not only weakened" in updates.doubts[0]) == (bool(share) or name != "another"), name
+    assert (promise(updates) < 10e-9) == (not share)
+
+
 @pytest.mark.parametrize("signal", [-0.5, 0.05])
 def test_one_that_is_given_up_again_elsewhere_has_moved_and_is_not_taken_for_stuck(
     bench: SteadyMirror, made: Made, tmp_path: Path, signal: float

@@ -10,7 +10,7 @@ from dm_calibration.hysteresis.responses import Reduction
 from dm_calibration.influence.bumps import Bump, bumps
 from dm_calibration.influence.quality import NO_RESPONSE
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.drift import DEAD_SHARE, DISTINCT_SIGNAL, FAILED_SIGNAL, Displaced, Drift
+from dm_calibration.recalibration.drift import DEAD_SHARE, DISTINCT_SIGNAL, FAILED_SIGNAL, NOTICED, Displaced, Drift
 from dm_common import Bools, Floats
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import weighted_fit
@@ -23,8 +23,6 @@ DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 DISPLACED_SIGMA = 0.5
 #: The same of a change of one coefficient, as by another focus of the interferometer, m rms.
 TERM_SIGMA = 1e-7
-#: Least displacement, in effective signal, at which an actuator is named where the map agrees.
-NOTICED = 0.01
 #: An actuator counts as failed beyond this many standard deviations from where it should stand.
 DISPLACED_SIGMAS = 4.0
 #: No actuator stands at an effective signal beyond this.
@@ -230,7 +228,8 @@ def failing_from(displaced: Mapping[int, Displaced], expected: Floats, drift: Dr
 def shown_at(effective: Floats, drift: Drift) -> Bools:
     """(N,) whether a map at the signals `effective` (N,) would show that actuators still fail, see :class:`Drift`."""
     moves = np.isnan(drift.stuck)
-    away = np.where(moves, effective, (effective - drift.failing) * drift.stuck / drift.failing)
+    share = np.maximum(np.abs(drift.stuck / drift.failing), DEAD_SHARE)  # of less, few maps would show anything
+    away = np.where(moves, effective, (effective - drift.failing) * share)
     return np.abs(away) >= np.where(moves, drift.failing, FAILED_SIGNAL)
 
 

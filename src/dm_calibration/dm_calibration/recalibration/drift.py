@@ -20,11 +20,13 @@ WARM_GAIN, WARM_FIGURE = 1e-3, 2e-9
 #: Mean square of the surprise of a few maps that may be due to chance.
 MISFIT_BY_CHANCE = 1.5
 #: Least signal at which a weak actuator can be distinguished from a displaced one, and least move that is attributed to
-#: an actuator without a response in the calibration; largest share of its move that a dead actuator still makes.
+#: an actuator without a response in the calibration; share of its move up to which one is called dead.
 DISTINCT_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Least displacement, in effective signal, at which an actuator counts as failed: errors of the law can look like
 #: displacements of up to 0.03.
 FAILED_SIGNAL = 0.05
+#: Least displacement, in effective signal, at which an actuator is named where the map agrees.
+NOTICED = 0.01
 
 
 @dataclass(frozen=True)
@@ -133,16 +135,17 @@ class Drift:
         """The same with actuators that stand at `stuck` (N,), NaN = moves, from a map at the signals `effective` on.
 
         One that stands between 0 and its signal may as well be weakened: then its next move makes an error. So may one
-        that was given up before and now stands elsewhere.
+        that was given up before and now stands elsewhere. At a small signal every place within it is near 0.
 
         Args:
             zernike: (K, N) m per unit of effective signal.
         """
-        share = np.divide(stuck, effective, out=np.zeros_like(stuck), where=np.abs(effective) >= DISTINCT_SIGNAL)
+        signal, toward = np.abs(effective), stuck * np.sign(effective)
+        share = np.divide(np.abs(stuck), signal, out=np.zeros_like(stuck), where=signal > 0.0)
         new = np.isnan(self.stuck) & np.isfinite(stuck)
         elsewhere = np.abs(stuck - self.stuck) >= FAILED_SIGNAL
-        weak = (new | elsewhere) & (share >= DEAD_SHARE) & (share < 1.0)
-        error = float((np.abs(zernike[PISTON_TILT:]) @ np.where(weak, share * (1.0 + np.abs(effective)), 0.0)).max())
+        weak = (new | elsewhere) & (toward > np.where(signal < DISTINCT_SIGNAL, -signal, NOTICED)) & (share < 1.0)
+        error = float((np.abs(zernike[PISTON_TILT:]) @ np.where(weak, share * (1.0 + signal), 0.0)).max())
         failing = np.where(weak, effective, np.where(new, np.nan, self.failing))
         return replace(self, stuck=stuck, failing=failing, disagreement=max(self.disagreement, error))
 
