@@ -170,6 +170,26 @@ def test_what_was_held_before_a_calibration_is_in_doubt_while_it_fades() -> None
     assert built[0] == pytest.approx(hours[-1]) and 0.0 < built[1] < 0.7 * built[0] and built[2] < 0.01 * built[0]
 
 
+def test_a_recipe_includes_the_old_creep_of_when_it_was_measured() -> None:
+    """A calibration right after power-on: the mirror stood elsewhere before, and recipes follow within the hour."""
+    crept = 0.5 * np.random.default_rng(7).standard_normal(COUNT)
+    covariance = creep_covariance(run_of(CREEPS, 150), CREEPS)
+    law = replace(CREEPS, creep_covariance=covariance, crept_at=1000.0, crept=crept)
+    rest, state = np.zeros(COUNT), law.demagnetised(COUNT, 1000.0)
+    state = replace(state, crept=np.repeat(crept[:, None], len(CREEP_TIMES), axis=1))
+    error, times = creep_error(law), (3000.0, 3600.0, 90_000.0)
+    direct, *built = (
+        [error.bound(law.advance(state, time), rest, 0.05, measured).max_zernike for time in times]
+        for measured in (None, 3000.0, 0.0)
+    )
+    assert built[0] == sorted(built[0]) and built[0][1] < 0.2 * direct[1] < 0.2 * direct[2] < built[0][2]
+    assert built[1] == pytest.approx(direct, rel=0.05)  # one that was measured in the run
+    # Later maps shift a recipe that was built before them as they shift the figure.
+    now = law.advance(state, times[-1])
+    checked = creep_error(law, CreepShown(now.time, now.crept, now.crept_sigma, 1.0))
+    assert checked.bound(now, rest, 0.05, 3000.0).max_zernike < 0.2 * built[0][2]
+
+
 def test_bounds_count_creep_from_the_last_check_on() -> None:
     """A shape held for a day, partly unseen; after it maps show what it left, and later another is held for hours."""
     law = replace(CREEPS, creep_covariance=creep_covariance(run_of(CREEPS, 150), CREEPS))

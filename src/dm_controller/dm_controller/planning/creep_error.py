@@ -72,12 +72,9 @@ class CreepError:
         self._each = covariance[1]
         rows = np.vstack((zernike, sag_root))
         self._rows, self._coefficients, self._root = rows, len(zernike), root
-        self._in_figure = np.zeros((len(whole), len(law.creep_time)))
-        if law.crept.shape == whole.shape:
-            self._in_figure = law.crept[:, None] * np.exp(-IN_FIGURE_S / law.creep_time)
-        self._shown = shown or CreepShown(0.0, self._in_figure, np.zeros(len(law.creep_time)), 0.0)
+        self._before = law.crept[:, None] if law.crept.shape == whole.shape else np.zeros((len(whole), 1))
+        self._shown = shown or CreepShown(0.0, self._before, np.zeros(len(law.creep_time)), 0.0)
         self._share = self._shown.share * (law.creep_time > SLOW_S)
-        self._in_figure = self._in_figure + self._share * (self._shown.crept - self._in_figure)
         # Effect of a shape of the whole range held unobserved, by element.
         share = np.atleast_2d(law.creep_share).mean(axis=0)
         share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # of elements that follow the signals
@@ -104,16 +101,21 @@ class CreepError:
         ages = np.array([ahead, *(age for age in AGES if age > ahead)])
         faded = np.exp(-ages[:, None] / self._law.creep_time)  # (T, J)
         followed = position[:, None] + (state.crept - position[:, None]) * faded[:, None]
+        # Figure and recipes include the old creep of when they were measured, and what maps have shown since.
+        time, shown = self._law.creep_time, self._shown
+        begin = max((measured or 0.0) - self._law.crept_at, IN_FIGURE_S)
+        included = self._before * np.exp(-begin / time)
+        if measured is None or measured < shown.time:
+            included = included + self._share * (shown.crept - included)
         features = np.concatenate(
-            (np.broadcast_to(position[:, None], (*followed.shape[:2], 1)), followed - self._in_figure), axis=2
+            (np.broadcast_to(position[:, None], (*followed.shape[:2], 1)), followed - included), axis=2
         )
         if measured is not None:
-            then = np.exp(-np.clip(ages, *MEASURED_S)[:, None] / self._law.creep_time)
+            then = np.exp(-np.clip(ages, *MEASURED_S)[:, None] / time)[:, None]
             features[:, :, 0] = 0.0
-            features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
+            features[:, :, 1:] = followed - position[:, None] * (1.0 - then) - included * then
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
         # One unobserved shape that all elements have followed, shown by maps in part; and what was held since.
-        time, shown = self._law.creep_time, self._shown
         same = np.minimum(shown.sigma * np.exp(-np.maximum(state.time - shown.time, 0.0) / time), state.crept_sigma)
         since = np.sqrt(np.square(state.crept_sigma) - np.square(same))
         figure = self._share * shown.sigma  # maps shift recipes as they shift the figure
@@ -122,7 +124,6 @@ class CreepError:
         shared += unseen
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
         # Old creep counts from when the figure holds, or from when the recipe was measured, if that was later.
-        begin = max((measured or 0.0) - self._law.crept_at, IN_FIGURE_S)
         at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
         at = np.maximum(at, 0.0 if measured is None else begin)
         fade = np.exp(-at[:, None] / time) - np.exp(-begin / time)
