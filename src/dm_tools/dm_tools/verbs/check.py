@@ -49,7 +49,8 @@ def check(
         health = receive_health(client)
         # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
         # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
-        # another surface than the model predicts, so for a conditioned shape the model's bound counts.
+        # another surface than the model predicts, so for a conditioned shape the model's bound counts where it is
+        # larger: it holds no creep.
         patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
         client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
@@ -59,10 +60,10 @@ def check(
     lost = unknown_history(capabilities)
     if lost or capabilities is None:  # what a focus controller with that node's knowledge would promise
         promised = promise_of(calibration)
-    elif shape is None or shape.conditioned:
+    elif shape is None:
         promised = capabilities.error_bound
     else:
-        promised = shape.bound - shape.predicted
+        promised = max(shape.bound - shape.predicted, capabilities.error_bound if shape.conditioned else 0.0)
     if forget:
         console.print(response.message)
     else:
