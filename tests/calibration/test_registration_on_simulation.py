@@ -11,7 +11,7 @@ import yaml
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.calibrator import calibrate, check_fit
-from dm_calibration.influence.poke_check import PokeCheck
+from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError
@@ -22,6 +22,7 @@ from dm_common.errors import MeasurementError
 from dm_common.geometry import hexagonal_positions
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
+from dm_common.optics.sampling import edge_clustered_points
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig
 
@@ -109,6 +110,20 @@ def test_what_is_found_puts_it_right(
     assert second.registration is not None
     assert abs(second.registration.turn) < np.radians(0.2) and np.hypot(*second.registration.shift) < 1e-4
     assert second.registration.scale == pytest.approx(float(camera.get("mount_scale", 1.0)), abs=0.01)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("thickness", [1.5e-3, 2.4e-3])
+def test_a_plate_is_not_taken_for_a_membrane(thickness: float) -> None:
+    """Its bumps lean nowhere: the sign of all maps was not told, nor that the pitch is as configured."""
+    plate = Plate(PlateConfig(actuators=19, pitch=6.2e-3, thickness=thickness))
+    points, radius, noise = edge_clustered_points(300), 15e-3, np.random.default_rng(0)
+    sag = 1e-6 * plate.influence_at(radius * points.x, radius * points.y)
+    sag = sag * (1.0 + 0.1 * noise.standard_normal(19)) + 3e-9 * noise.standard_normal(sag.shape)
+    none = np.zeros(19, dtype=np.bool_)
+    found = [check_pokes(way * sag, points, plate.x, plate.y, radius, silent=none, unmoved=none) for way in (1, -1)]
+    (inverted,) = [each for each in found[1].findings if "opposite" in each]
+    assert "all actuators move the surface the opposite way" in inverted
+    assert not any("apart, configured" in each for check in found for each in check.findings)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal, size_text
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_common.limits import Limits
@@ -66,9 +66,9 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     """
     for name in ("actuator_x", "actuator_y"):
         if (size := len(getattr(message, name))) != message.actuators:
-            raise ValueError(f"mirror_info: {name} has {size} values: must have {message.actuators}")
+            raise ValueError(f"mirror_info: {size_text(name, size)}: must have {message.actuators}")
     if (size := len(message.neighbour_a)) != (other := len(message.neighbour_b)):
-        raise ValueError(f"mirror_info: neighbour_a has {size} values, neighbour_b {other}: must have as many")
+        raise ValueError(f"mirror_info: {size_text('neighbour_a', size)}, neighbour_b {other}: must have as many")
     pairs = np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.intp)
     return Mirror(
         name=message.name,
@@ -188,7 +188,7 @@ def _shaped(name: str, values: array[float], *shape: int, own: bool = False) -> 
         return field.reshape(-1, *shape) if own and field.size > math.prod(shape) else field.reshape(shape)
     except ValueError:
         wanted = " x ".join("any" if length < 0 else str(length) for length in shape) + (" (for each)" if own else "")
-        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {wanted}") from None
+        raise ValueError(f"hysteresis: {size_text(name, field.size)}: must be {wanted}") from None
 
 
 def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None:
@@ -202,7 +202,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         return None
     weight = _shaped("play_weight", message.play_weight, radius.size, message.powers, own=True)
     if not weight.size:
-        raise ValueError(f"hysteresis: play_weight has 0 values, must be {radius.size} x {message.powers} (for each)")
+        raise ValueError(f"hysteresis: play_weight has 0 values: must be {radius.size} x {message.powers} (for each)")
     duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
     slope_of = (duhem_weight.size, 2, -1) if duhem_weight.size > 1 else (-1,)
     own, rate = weight.shape[:-2], np.array(message.fading_rate, dtype=np.float64)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dm_common import Floats, Ints
+from dm_common.errors import size_text
 from dm_common.limits import Limits
 
 #: Largest relative difference between the aperture radii of a calibration and of the mirror that it belongs to.
@@ -38,7 +39,7 @@ class Mirror:
         for name in ("x", "y"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         if self.x.ndim != 1 or self.x.shape != self.y.shape or self.x.size == 0:
-            raise ValueError(f"actuator_x has {self.x.size} values and actuator_y {self.y.size}: must be equal, not 0")
+            raise ValueError(f"{size_text('actuator_x', self.x.size)}, actuator_y {self.y.size}: must be equal, not 0")
         if not (np.isfinite(self.x).all() and np.isfinite(self.y).all()):
             raise ValueError("actuator_x and actuator_y must be finite")
         if (farthest := float(max(np.abs(self.x).max(), np.abs(self.y).max()))) > FARTHEST_M:

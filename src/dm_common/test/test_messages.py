@@ -66,8 +66,8 @@ def test_a_mirror_is_what_the_driver_describes() -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"actuator_x": [0.0]}, "actuator_x has 1 values: must have 7"),
-        ({"neighbour_a": [0]}, "neighbour_a has 1 values, neighbour_b 12: must have as many"),
+        ({"actuator_x": [0.0]}, "actuator_x has 1 value: must have 7"),
+        ({"neighbour_a": [0]}, "neighbour_a has 1 value, neighbour_b 12: must have as many"),
         ({"neighbour_a": [0] * 12, "neighbour_b": [7] * 12}, r"indices must lie in 0\.\.6"),
         ({"working_aperture_diameter": 0.0}, "working_radius = 0.0: must be positive"),
         ({"signal_min": 1.0}, "the lower limit must be below the upper"),
@@ -102,11 +102,11 @@ def test_a_map_of_another_convention_or_without_samples_is_refused() -> None:
 
 def test_hysteresis_that_was_not_identified_and_one_that_makes_no_sense() -> None:
     assert hysteresis_model_from(ActuatorHysteresis()) is None
-    with pytest.raises(ValueError, match="play_weight has 3 values, must be 2 x 1"):
+    with pytest.raises(ValueError, match="play_weight has 3 values: must be 2 x 1"):
         hysteresis_model_from(ActuatorHysteresis(play_radius=[0.0, 0.5], play_weight=[1.0, 2.0, 3.0], powers=1))
     one = ActuatorHysteresis(play_radius=[0.0], play_weight=[1.0], powers=1, fading_rate=[1.0, 3.0])
     one.fading_weight = [0.1, 0.2, 0.3]
-    with pytest.raises(ValueError, match="fading_weight has 3 values, must be 2 x any"):
+    with pytest.raises(ValueError, match="fading_weight has 3 values: must be 2 x any"):
         hysteresis_model_from(one)
 
 

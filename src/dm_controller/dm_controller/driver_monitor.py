@@ -221,8 +221,10 @@ class DriverMonitor:
             failed: what ends it now; None = whatever `progress` finds.
         """
         order = self.order
-        if order is None or not order.applied or order.reached or order.stopped:
+        if order is None or order.reached or order.stopped:
             return []
+        if not order.applied:
+            return self._reached_nevertheless(order, now)
         if failed is None:
             progress = self.progress(order, now)
             order.reached, failed = progress.reached, progress.failed
@@ -230,6 +232,17 @@ class DriverMonitor:
             return []
         order.applied, order.refusal = False, failed
         return [Log("warning", f"the shape was not reached: {failed}"), PublishState(order)]
+
+    def _reached_nevertheless(self, order: Order, now: float) -> list[Effect]:
+        """Publish, once, that a driver that was not heard for a while has ended the move well."""
+        told = order.refusal
+        if told is None or told.error_code != ErrorCode.DRIVER_UNAVAILABLE or order.move is None:
+            return []
+        order.refusal = None
+        order.applied = order.reached = self.progress(order, now).reached
+        if not order.reached:
+            order.refusal = told
+        return [PublishState(order)] if order.reached else []
 
     def cancelled(self, now: float) -> list[Effect]:
         """Publish that the last order is cancelled, once, unless the mirror has stood in its shape."""

@@ -1108,6 +1108,26 @@ def test_a_move_that_ends_on_its_way_is_told_of_once(bench: Bench, state: int, c
     assert bench.outcomes[-1].request is order.request
 
 
+@pytest.mark.parametrize("lost", ["", "pdm_driver has died"])
+def test_a_move_that_ends_well_while_the_driver_is_not_heard_is_told_of_again(lost: str) -> None:
+    """It said that the shape was not applied, for as long as that shape stood and was held."""
+    bench = Bench(driver_timeout=1.0)
+    bench.degauss()
+    bench.obeys = False
+    order = bench.ask(0.02)
+    bench.requested = move_of(order).signals
+    bench.report(moving=True)
+    bench.do(bench.controller.tick(bench.now, lost))
+    bench.wait(1.5)
+    assert [outcome.applied for outcome in bench.outcomes] == [True, False]
+    assert bench.refusal().error_code == ErrorCode.DRIVER_UNAVAILABLE
+    bench.obeys = True
+    bench.move(move_of(order).signals)
+    bench.wait(3.0)
+    assert [outcome.applied for outcome in bench.outcomes] == [True, False, True]
+    assert bench.outcomes[-1].refusal is None and bench.controller.hold.active
+
+
 def test_a_move_that_is_cancelled_on_its_way_is_told_of_once(bench: Bench) -> None:
     bench.obeys = False
     order = bench.ask(0.02)

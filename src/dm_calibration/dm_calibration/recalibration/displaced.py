@@ -211,7 +211,8 @@ def noticed_error(displaced: Mapping[int, Displaced], zernike: Floats) -> float:
 def failing_from(displaced: Mapping[int, Displaced], expected: Floats, drift: Drift, shown: Bools) -> Floats:
     """`failing` of :class:`Drift` after a map.
 
-    A weakened actuator misses the same share of every move, so near 0 it stands where it should.
+    A weakened actuator misses the same share of every move, so near 0 it stands where it should; a stuck one stands
+    where it should in the shape in which it got stuck, and surely not beyond its place.
 
     Args:
         displaced, expected: as of :func:`worst_other_error`; only failed actuators count.
@@ -221,7 +222,9 @@ def failing_from(displaced: Mapping[int, Displaced], expected: Floats, drift: Dr
     failing = np.where(shown, np.nan, drift.failing)
     for actuator, one in displaced.items():
         if failed(one) and np.isnan(drift.stuck[actuator]):
-            failing[actuator] = FAILED_SIGNAL * abs(expected[actuator] / one.more)
+            wanted, stuck = expected[actuator], min(abs(expected[actuator] + one.more) + FAILED_SIGNAL, 1.0)
+            weakened = wanted != 0.0 and DEAD_SHARE <= 1.0 + one.more / wanted < 1.0
+            failing[actuator] = FAILED_SIGNAL * abs(wanted / one.more) if weakened else stuck
     return failing
 
 

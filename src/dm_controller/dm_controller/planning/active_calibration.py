@@ -11,7 +11,7 @@ from dm_msgs.msg import Calibration, MirrorInfo
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
-from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal
+from dm_common.errors import NO_CALIBRATION, ErrorCode, Refusal, size_text
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, mirror_from, recipe_book_from, stamp_ns, taken
@@ -173,7 +173,7 @@ def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Flo
     def matrix(name: str, rows: int) -> Floats:
         values = np.asarray(getattr(calibration, name), dtype=float)
         if values.size != rows * actuators:
-            raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")
+            raise ValueError(f"calibration: {size_text(name, values.size)}: must be {rows} x {actuators}")
         return values.reshape(rows, actuators)
 
     names = ("sample_x", "sample_y", "sample_weight", "zernike_offset", "sag_offset")
