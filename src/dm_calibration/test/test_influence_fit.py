@@ -399,6 +399,8 @@ def test_too_few_maps_are_refused_in_words(mirror: Mirror) -> None:
     blind = replace(maps, valid_fraction=np.zeros(len(maps)))
     with pytest.raises(TooFewMapsError, match="none of the 83 maps is usable"):
         fit_influence(blind)
+    with pytest.raises(TooFewMapsError, match="no command has a map"):
+        fit_influence(replace(maps, coefficients=maps.coefficients * np.nan, sag=maps.sag * np.nan))
 
 
 def test_unknown_method_and_label(mirror: Mirror) -> None:

@@ -118,8 +118,9 @@ def fit_influence(
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
     if all(reasons):
         rejected = maps.rejected(reasons)
-        first = f"; the first: {': '.join(rejected[0])}" if rejected else ""
-        raise TooFewMapsError(f"none of the {len(rejected)} maps is usable{first}")
+        if not rejected:
+            raise TooFewMapsError("no command has a map")
+        raise TooFewMapsError(f"none of the {len(rejected)} maps is usable; the first: {': '.join(rejected[0])}")
     fitted = _fit_good(maps, reasons)
     for _ in range(int(screening.DROPPED_MAX * len(maps))):
         outlier = fitted.worst_outlier(options)

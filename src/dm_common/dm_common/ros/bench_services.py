@@ -238,7 +238,7 @@ class BenchServices:
                 rclpy.spin_until_future_complete(node, future, SingleThreadedExecutor(context=context), timeout)
                 response = future.result() if future.done() else None
             if response is None:
-                return "the mirror was not brought back to mid range: pdm_driver ends too or does not answer"
+                return "the mirror was not brought back to mid range: pdm_driver ends too, or has not answered in time"
             if response.error_code != ErrorCode.OK:
                 return f"the mirror could NOT be brought back to mid range: {response.message}"
             return "the mirror is back at mid range"

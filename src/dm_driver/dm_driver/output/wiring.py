@@ -98,6 +98,6 @@ class OutputStage:
         return codes
 
     def outcome(self, codes: NDArray[np.uint16]) -> tuple[Shape, Floats]:
-        """(N,) signals and (N,) V at the actuators for these codes; one without a channel rests at 0 V."""
+        """(N,) signals and (N,) V at the actuators for these codes; one without a channel is at rest."""
         of_actuator = np.where(self.connected, codes[self.channels], self._rest[0])
         return self.scale.signals_of_codes(of_actuator), self.scale.volts_of_codes(of_actuator)
