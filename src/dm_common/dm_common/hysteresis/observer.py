@@ -81,7 +81,7 @@ class HysteresisTracker:
         turns = report.turns - last.turns
         # Of a shape that was left again before it was reported, nobody knows how long it was held.
         at = report.signals if report.turned_at is None else report.turned_at
-        left = turns > 1 or (turns == 1 and not np.array_equal(report.signals, at))
+        left = turns > 1 or (turns == 1 and not any(np.array_equal(at, seen.signals) for seen in (report, last)))
         # Without a link it is not known whether the outputs held: the unit may have lost power.
         since = self._seen if left or (report.linked and not last.linked) else report.time
         if report.degausses > last.degausses:
