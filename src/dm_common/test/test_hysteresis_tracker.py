@@ -104,12 +104,15 @@ def test_how_long_a_shape_was_held_that_no_report_showed_is_not_known(
     assert tracker.state.crept_sigma[minutes] == pytest.approx(UNSEEN, rel=0.01)
 
 
-def test_a_shape_that_is_left_from_where_it_was_seen_leaves_no_doubt(tracker: HysteresisTracker) -> None:
-    """Each move after minutes at rest would have made bounds four times as wide."""
+@pytest.mark.parametrize("time, turned_at", [(3600.0, REST), (1.03, A)])
+def test_a_shape_that_is_left_from_where_it_was_seen_or_at_once_leaves_no_doubt(
+    tracker: HysteresisTracker, time: float, turned_at: np.ndarray
+) -> None:
+    """After minutes at rest bounds were four times as wide; at thirty requests a second moves turn on their way."""
     before = tracker.state
-    tracker.observe(report(3600.0, C, 2, REST))
+    tracker.observe(report(time, C, 2, turned_at))
     assert before is not None and tracker.state is not None
-    np.testing.assert_allclose(tracker.state.crept_sigma, LAW.advance(before, 3600.0).crept_sigma)
+    np.testing.assert_allclose(tracker.state.crept_sigma, LAW.advance(before, time).crept_sigma)
 
 
 def test_a_clock_that_jumps_in_a_degauss_leaves_creep_in_doubt() -> None:

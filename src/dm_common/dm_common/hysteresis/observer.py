@@ -17,10 +17,10 @@ from dm_common.hysteresis.creep_record import CreepRecord, held_unseen, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.mirror import Applied
 
-#: Reports kept for a law that is identified later: a calibration run makes some hundred.
-LOG_LENGTH = 5_000
-#: Estimates kept for maps that arrive late.
-ESTIMATES_KEPT = 500
+#: Reports kept for a law that is identified later (a calibration run makes some hundred), estimates for late maps.
+LOG_LENGTH, ESTIMATES_KEPT = 5_000, 500
+#: While the mirror moves, two reports are closer than this, s: no shape is held for long between them.
+REPORTS_APART_S = 0.5
 
 
 class HysteresisTracker:
@@ -82,6 +82,7 @@ class HysteresisTracker:
         # Of a shape that was left again before it was reported, nobody knows how long it was held.
         at = report.signals if report.turned_at is None else report.turned_at
         left = turns > 1 or (turns == 1 and not any(np.array_equal(at, seen.signals) for seen in (report, last)))
+        left &= report.time - self._seen > REPORTS_APART_S
         # Without a link it is not known whether the outputs held: the unit may have lost power.
         since = self._seen if left or (report.linked and not last.linked) else report.time
         if report.degausses > last.degausses:
