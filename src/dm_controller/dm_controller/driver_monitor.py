@@ -8,6 +8,7 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -213,7 +214,8 @@ class DriverMonitor:
         return Progress(share=share, remaining=gap)
 
     def ended_early(self, now: float, failed: Refusal | None = None) -> list[Effect]:
-        """Publish that a shape is not reached, once, if the driver took the command and something ended the move.
+        """Publish that a shape is not reached, once, if the driver took the command and something ended the move; and
+        that it is, if a driver that was not heard has reached it nevertheless.
 
         A move that takes longer than `move_timeout` may still end well: only `move_focus` gives up on it.
 
@@ -238,11 +240,10 @@ class DriverMonitor:
         told = order.refusal
         if told is None or told.error_code != ErrorCode.DRIVER_UNAVAILABLE or order.move is None:
             return []
-        order.refusal = None
-        order.applied = order.reached = self.progress(order, now).reached
-        if not order.reached:
-            order.refusal = told
-        return [PublishState(order)] if order.reached else []
+        if not self.progress(replace(order, refusal=None), now).reached:
+            return []
+        order.applied, order.reached, order.refusal = True, True, None
+        return [PublishState(order)]
 
     def cancelled(self, now: float) -> list[Effect]:
         """Publish that the last order is cancelled, once, unless the mirror has stood in its shape."""

@@ -125,14 +125,14 @@ def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) ->
     return identify(run, test, candidates), run
 
 
-def few_maps(maps: int, own: int) -> float:
+def few_maps_factor(maps: int, own: int) -> float:
     """Factor on the error of held-out moves if `maps` are few for `own` actuators with own laws (0 = common)."""
     return max(1.0, (MAPS_BEYOND / max(maps - own, 1)) ** FEWER) if own else 1.0
 
 
 def _few_maps(found: Identification, run: Run) -> float:
     own = found.fit.candidate.own and found.fit.candidate.hysteretic
-    return few_maps(int(run.responses.usable.sum()), run.signals.shape[1] * own)
+    return few_maps_factor(int(run.responses.usable.sum()), run.signals.shape[1] * own)
 
 
 def _held(found: Identification, maps: MapSet) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.hysteresis_fit import few_maps, fit_hysteresis
+from dm_calibration.hysteresis.hysteresis_fit import few_maps_factor, fit_hysteresis
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
@@ -72,7 +72,7 @@ class LawError:
 
     def after(self, maps: int) -> float:
         """m, after `maps` maps."""
-        return float(self.first * few_maps(maps, self.own) / np.sqrt(maps))
+        return float(self.first * few_maps_factor(maps, self.own) / np.sqrt(maps))
 
 
 def forecast(
