@@ -146,7 +146,7 @@ def driver_refusal(report: ActuatorState | None) -> Refusal | None:
     reason = f": {report.message}" if report.message else ""
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
         return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, f"pdm_driver has lost the link to the electronics{reason}")
-    if report.driver_state == ActuatorState.STATE_SAFING and not report.message.startswith("pdm_driver is not active"):
+    if report.driver_state == ActuatorState.STATE_SAFING and report.error_code != ErrorCode.DRIVER_INACTIVE:
         return Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
     return Refusal(ErrorCode.DRIVER_INACTIVE, report.message or "pdm_driver is not active: activate it first")
 

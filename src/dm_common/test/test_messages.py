@@ -10,6 +10,7 @@ import pytest
 from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo
 from dm_msgs.srv import Measure
 
+from dm_common.errors import ErrorCode
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.messages import (
     applied_from,
@@ -143,15 +144,22 @@ def test_recipes_that_do_not_fit_together_are_refused() -> None:
         RecipeBook((replace(recipe(-0.01), max_zernike=np.nan),), 100, 0.0)
 
 
+INACTIVE, SHUT_DOWN = "pdm_driver is not active: activate it", "pdm_driver was shut down: start its process again"
+
+
 @pytest.mark.parametrize(
-    ("message", "sentence"),
+    ("code", "message", "sentence"),
     [
-        ("", "pdm_driver is not active"),
-        ("signals: refused", "pdm_driver is not active: signals: refused"),
-        ("pdm_driver is not active: activate it", "pdm_driver is not active: activate it"),
+        (ErrorCode.OK, "", "pdm_driver is not active"),
+        (ErrorCode.OUT_OF_RANGE, "signals: refused", "pdm_driver is not active: signals: refused"),
+        (ErrorCode.DRIVER_INACTIVE, INACTIVE, INACTIVE),
+        (ErrorCode.DRIVER_INACTIVE, SHUT_DOWN, SHUT_DOWN),
     ],
 )
-def test_a_driver_on_its_way_to_the_safe_shape_is_called_inactive_once(message: str, sentence: str) -> None:
-    refusal = driver_refusal(ActuatorState(driver_state=ActuatorState.STATE_SAFING, message=message))
+def test_a_driver_on_its_way_to_the_safe_shape_is_called_inactive_once(
+    code: ErrorCode, message: str, sentence: str
+) -> None:
+    safing = ActuatorState(driver_state=ActuatorState.STATE_SAFING, error_code=code, message=message)
+    refusal = driver_refusal(safing)
     assert refusal is not None
     assert str(refusal) == sentence
