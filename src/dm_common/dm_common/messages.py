@@ -167,7 +167,7 @@ def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
         time=seconds(message.header.stamp),
         signals=signals,
         turned_at=turned_at if turned_at.shape == signals.shape else None,
-        **taken(message, "turns", "degausses", "history_known", "moving"),
+        **taken(message, "turns", "degausses", "history_known", "moving", "sequence"),
         requested=np.array(message.requested, dtype=np.float64),
         active=message.driver_state == ActuatorState.STATE_ACTIVE,
         linked=message.driver_state != ActuatorState.STATE_LINK_LOST,

@@ -1,5 +1,7 @@
 """Geometry, limits and numbers of the actuators of a mirror, reports of its driver, which calibration belongs to it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -118,6 +120,7 @@ class Applied:
         active: the driver is active, so the electronics follow commands.
         linked: the electronics are reachable.
         heard: s, when the driver last sent this; a repeated report confirms that the shape is still held.
+        sequence: number of writes since activation.
     """
 
     time: float
@@ -131,3 +134,8 @@ class Applied:
     active: bool = True
     linked: bool = True
     heard: float = -np.inf
+    sequence: int = 0
+
+    def counts_anew(self, last: Applied) -> bool:
+        """Whether the driver was activated anew since the report `last`."""
+        return self.turns < last.turns or self.degausses < last.degausses or self.sequence < last.sequence

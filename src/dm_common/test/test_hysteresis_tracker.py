@@ -182,6 +182,20 @@ def test_another_activation_begins_anew(tracker: HysteresisTracker) -> None:
     assert "activated again" in tracker.unknown
 
 
+@pytest.mark.parametrize("follow_later", [False, True])
+def test_a_driver_activated_again_is_noticed_by_its_writes(follow_later: bool) -> None:
+    """Its moves and degausses may have passed those of before until a report of it is heard."""
+    observer = HysteresisObserver()
+    if not follow_later:
+        observer.use(LAW, 0.0)
+    observer.observe(report(0.0, REST, degausses=0, history_known=False, sequence=1))
+    observer.observe(report(1.0, A, moving=True, sequence=40))
+    observer.observe(report(2.0, B, moving=True, sequence=900))
+    observer.observe(report(3.0, C, moving=True, sequence=500))
+    observer.use(LAW, 0.0)
+    assert "activated again" in observer.unknown
+
+
 def test_a_clock_set_back_leaves_hysteresis_alone(tracker: HysteresisTracker) -> None:
     tracker.observe(report(50.0, A, 2, REST))
     before = tracker.state

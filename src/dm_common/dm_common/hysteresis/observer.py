@@ -72,7 +72,7 @@ class HysteresisTracker:
         if report.time < last.time or max(report.time, report.heard) < self.state.time:
             # Hysteresis does not depend on time; creep pauses until the clock has caught up.
             self.state = replace(self.state, time=max(report.time, report.heard))
-        if report.turns < last.turns or report.degausses < last.degausses:
+        if report.counts_anew(last):
             # Best guess: since the driver was last heard, the mirror has stood at the signals that it reports now.
             self.state = self.law.move(self.state, report.signals, min(self._seen, report.time))
             self.unknown = "the driver was started or activated again"
@@ -286,7 +286,7 @@ class HysteresisObserver:
 
 def _between(before: Applied, between: Applied, after: Applied) -> bool:
     """Whether a law needs no report of `between`, because it lies within one move or one rest."""
-    if not _phase(before) == _phase(between) == _phase(after):
+    if not _phase(before) == _phase(between) == _phase(after) or after.counts_anew(between):
         return False
     return before.time <= between.time <= after.time and (between.moving or between.time == after.time)
 
