@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,8 @@ from dm_msgs.action import BuildRecipes
 from dm_msgs.msg import Capabilities, Recipe, RecipeBook
 from typer.testing import CliRunner
 
+from dm_client import DeformableMirrorError
+from dm_common.errors import ErrorCode
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import terms_of
 from dm_tools import cli
@@ -82,6 +85,22 @@ def test_the_duration_is_told_beforehand(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(recipes, "get_parameter", lambda _client, _node, name: told[name])
     client = SimpleNamespace(capabilities=Capabilities(condition_time=4.4))
     assert recipes.expected_run(client, 4) == "4 recipes in about 58 s if a map takes 0.3 s"
+
+
+def test_recipes_are_built_without_a_forecast_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(*_of: object) -> float:
+        raise DeformableMirrorError(ErrorCode.TIMEOUT, "the node `calibration` does not answer")
+
+    client = SimpleNamespace(
+        subscribe=lambda *_topic: True,
+        build_recipes=lambda *_goal, **_options: BuildRecipes.Result(message="1 of 1 recipes stored"),
+        wait=lambda *_until: True,
+        latest=lambda _topic: RecipeBook(calibration_id="a", recipes=[Recipe()]),
+    )
+    monkeypatch.setattr(recipes, "get_parameter", silent)
+    monkeypatch.setattr(recipes, "running_suite", lambda _namespace: nullcontext(client))
+    built = CliRunner().invoke(cli.make_app(), ["recipes", "--curvatures", "0.02"])
+    assert built.exit_code == 0 and "1 of 1 recipes stored" in built.output, built.output
 
 
 def test_added_terms_go_by_the_names_that_measure_prints() -> None:

@@ -1,10 +1,12 @@
 """`dm recipes`: build recipes on the bench, and list those of the calibration in use."""
 
 import math
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 
+from dm_common.errors import Refusal
 from dm_common.figures import counted, with_point
 from dm_tools.output import (
     JsonOption,
@@ -137,7 +139,8 @@ def recipes(
             each = usual_spheres(client.capabilities) if chosen is None else chosen
             wanted = [curvature for curvature in each for _ in shapes]
             terms = [term for _ in each for shape in shapes for term in shape]
-            console.print(f"expected: {expected_run(client, len(wanted))}")
+            with suppress(Refusal):  # nodes that do not tell their parameters: the run needs no forecast
+                console.print(f"expected: {expected_run(client, len(wanted))}")
             result = _build(
                 client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
             )
