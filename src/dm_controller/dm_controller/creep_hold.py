@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from dm_common import Floats
+from dm_common.errors import ErrorCode
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import same_signals
 from dm_controller.driver_monitor import DriverMonitor
-from dm_controller.focus_types import Moment, SendCommand
+from dm_controller.focus_types import Effect, Log, Moment
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
@@ -42,6 +43,7 @@ class CreepHold:
         self._values, self._monitor = values, monitor
         self.corrections = 0
         self.ended = ""
+        self._refused = int(ErrorCode.OK)  # by the driver: why, of the last correction
 
     @property
     def active(self) -> bool:
@@ -82,15 +84,22 @@ class CreepHold:
         if due and not order.follow(requested):  # else a correction was lost, or one that seemed lost has come
             self.end("another command came")
 
-    def command(self, estimate: ActuatorEstimate, now: Moment) -> list[SendCommand]:
-        """The corrections that are due for the shape, by the driver's last report and the estimate for `now`."""
+    def command(self, estimate: ActuatorEstimate, now: Moment) -> list[Effect]:
+        """The corrections that are due for the shape, by the driver's last report and the estimate for `now`.
+
+        They are sent again as long as the driver refuses them, which is logged once.
+        """
         order, report = self._monitor.order, self._monitor.latest
         if order is None or not order.creep_held or report is None or report.moving:
             return []
         if report.holder not in ("", order.request.holder):
             return []  # goes on afterwards if the holder leaves the shape as it is
-        signals = self.correction(estimate, now.time)
-        return [] if signals is None else [order.send(signals, now, report.turns)]
+        if (signals := self.correction(estimate, now.time)) is None:
+            return []
+        before, self._refused = self._refused, 0 if order.sent[-1].confirmed else report.error_code
+        text = f"a correction for creep was not taken; the driver says: {report.message}"
+        news: list[Effect] = [Log("warning", text)] if self._refused not in (ErrorCode.OK, before) else []
+        return [*news, order.send(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s) for a mirror at rest in the state `estimate`; None = none is due."""

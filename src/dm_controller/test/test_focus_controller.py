@@ -1017,6 +1017,20 @@ def test_a_correction_that_is_lost_is_sent_again(timeout: float) -> None:
     assert bench.error(move_of(order).effective) < 1e-4
 
 
+def test_a_driver_that_refuses_corrections_is_told_of_once(bench: Bench) -> None:
+    bench.ask(0.02)
+    bench.wait(2.0)
+    for told in (1, 2):
+        bench.obeys, bench.error_code, sent = False, ErrorCode.STALE, len(bench.commands)
+        while len(bench.commands) < sent + 4:
+            bench.wait(0.1)
+            bench.report(message="actuator_command refused: 2 s old")
+        text = "a correction for creep was not taken; the driver says: actuator_command refused: 2 s old"
+        assert bench.log.count(text) == told
+        bench.obeys, bench.error_code = True, ErrorCode.OK
+        bench.wait(10.0)
+
+
 def test_a_correction_that_arrives_late_is_known_again(bench: Bench) -> None:
     order = bench.ask(0.02)
     bench.wait(2.0)
