@@ -126,6 +126,8 @@ class ClockError(CodedError, TimeoutError):
 NO_CALIBRATION = "no calibration is in use: run `./dm calibrate` or load_calibration"
 #: In the message of `capabilities`, precedes the reason why the history of the actuators is not known.
 HISTORY_UNKNOWN = "wider error bound: "
+#: In the message of `update_calibration`, where an actuator that was given up may only be weakened.
+CHECK_ANOTHER_SHAPE = "check another shape"
 
 #: Failures that are reported by a code and a message; any other exception is a defect.
 EXPECTED = (CodedError, ValueError)

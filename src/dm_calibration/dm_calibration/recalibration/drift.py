@@ -8,6 +8,7 @@ from scipy.linalg import cho_solve
 from scipy.special import ndtri
 
 from dm_common import Floats
+from dm_common.errors import CHECK_ANOTHER_SHAPE
 from dm_common.mirror import APERTURE_TOLERANCE, actuators_text
 from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import GOES_ON_WITHOUT
@@ -162,7 +163,7 @@ class Drift:
     @property
     def given_up(self) -> str:
         """Sentence on the actuators that no longer move and where they stand; "" = all move."""
-        weak = np.where(np.isfinite(self.failing), ", if not only weakened: check another shape", "")
+        weak = np.where(np.isfinite(self.failing), f", if not only weakened: {CHECK_ANOTHER_SHAPE}", "")
         places = [
             f"{index + 1} (fixed at {at:+.2f}{weak[index]})" for index, at in enumerate(self.stuck) if np.isfinite(at)
         ]

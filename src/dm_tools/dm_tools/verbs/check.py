@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from dm_common.errors import CHECK_ANOTHER_SHAPE
 from dm_common.figures import accuracy_text, counted
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import (
@@ -93,7 +94,7 @@ def check(
         then = "one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate"
     elif without and dry_run:
         then = "the same command without --dry-run continues so; nothing is changed yet"
-    elif without and "check another shape" in response.message:
+    elif without and CHECK_ANOTHER_SHAPE in response.message:
         then = "./dm focus to another curvature, then ./dm check: bounds stay wide until a map shows that it is stuck"
     elif without:
         then = "ask for the shape again: the present command still relies on all actuators; ./dm status shows the range"
