@@ -25,8 +25,8 @@ RUNNING = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.S
 
 
 def warning_in(result: Any) -> str:
-    """The warning in the message of a Calibrate result; "" = none."""
-    return next((part for part in result.message.split("; ") if part.startswith("warning: ")), "")
+    """The warnings in the message of a Calibrate result; "" = none."""
+    return "; ".join(part for part in result.message.split("; ") if part.startswith("warning: "))
 
 
 class ExternalGoals:
