@@ -27,12 +27,6 @@ from dm_common.mirror import actuators_text
 SLOPE_MIN = 0.1
 #: A simpler candidate is preferred unless its held-out error is larger by more than this factor.
 PARSIMONY = 1.03
-#: With fewer training maps per actuator than this, or with test maps in the first half of a run (it may end early),
-#: each half of the test maps is predicted by a fit that includes the other half. A fit without any test maps would have
-#: to extrapolate: its median error over mirrors is 5 to 10 nm after 100 maps; that of the final fit is 3 nm. With more
-#: maps the other half tells too well, as test maps are of one kind and follow each other: five mirrors of 37 actuators
-#: after 162 maps predict 95 % of them within 1.2 to 1.8 nm with it, 1.2 to 3.7 without, and requests within 4.0 to 6.1.
-FEW = 3
 #: Fewest turns and least swing (normalised) with which an actuator shows its law. One actuator, or up to QUIET_SHARE of
 #: all, may turn or move less: they then follow the common law of the others.
 TURNS_MIN, SWING_MIN, QUIET_SHARE = 10, 0.3, 0.1
@@ -207,18 +201,16 @@ class _Choice:
 
 
 def _with_tests(run: Run, test: Bools, best: _Tried, choice: _Choice) -> tuple[LawFit, Floats]:
-    """The chosen law fitted to all maps, and (M, D) the residual of the `test` maps that fits without them leave."""
-    usable, alone = run.responses.usable, np.where(test[:, None], best.whole.residual, np.nan)
-    held_out = alone.copy()
-    if test[: len(test) // 2].any() or choice.train.sum() < FEW * run.signals.shape[1]:
-        half = 2 * np.cumsum(test) > test.sum()
-        for left_out in (test & half, test & ~half):
-            if left_out.any():
-                held_out[left_out] = best.problem.fit(usable & ~left_out, best.whole).residual[left_out]
-    whole = best.problem.fit(usable, best.whole)
+    """The chosen law fitted to all maps, and (M, D) the residual that the fit without the `test` maps leaves of them.
+
+    No other test map may help to predict one: they are of one kind and follow each other, so that two to four times
+    less was promised than requests erred by.
+    """
+    held_out = np.where(test[:, None], best.whole.residual, np.nan)
+    whole = best.problem.fit(run.responses.usable, best.whole)
     if flat := _too_flat(run, whole, choice.slope_min):
         choice.refused["the fit that includes the test moves"] = flat
-        return best.whole, alone
+        return best.whole, held_out
     return whole, held_out
 
 
