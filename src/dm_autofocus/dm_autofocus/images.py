@@ -157,10 +157,12 @@ def grey(message: Any) -> NDArray:
 
 
 def exposure_fault(image: NDArray) -> str:
-    """Fault in the exposure of grey levels (H, W): black or NaN, or many at the largest value; "" = none."""
+    """Fault in the exposure of grey levels (H, W): black or NaN, almost black, many at the largest value; "" = none."""
     top = np.fmax.reduce(image, axis=None)  # leaves NaN out
     if not top > 0:
         return "the image is black"
+    if image.dtype.kind == "u" and image.mean() < 1:  # noise and hot pixels; numbers of other types have any scale
+        return f"the image is almost black: its mean grey level is {image.mean():.2g}"
     share = float(np.mean(image == top))
     if share < CLIPPED:
         return ""
