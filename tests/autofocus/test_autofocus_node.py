@@ -558,6 +558,11 @@ def test_tracking_is_not_ended_by_a_goal_that_cannot_be_nor_by_a_range_that_narr
     scene.refuse_beyond = HIGH
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert found.error_code == ErrorCode.TIMEOUT and found.message.endswith("none came; is the camera running?")
+    scene.node.destroy_publisher(scene._image)
+    wait_until(lambda: not observer.node.count_publishers("image_raw"), 10, "the end of the camera's topic")
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.TIMEOUT
+    assert found.message.endswith("nobody publishes there; is the camera running, and is this its topic?")
 
 
 def test_a_stack_of_images_of_two_encodings_is_refused(scene: FilmedScene, observer: Observer) -> None:

@@ -237,6 +237,8 @@ class FocusProbe:
                 if message is None:
                     newest = None if self.newest is None or self.newest is before else seconds(self.newest.header.stamp)
                     reason = self._gate.reason(newest, self._apart, limit, self._arrived)
+                    if self._node.count_publishers(self.topic) == 0:
+                        reason = "nobody publishes there; is the camera running, and is this its topic?"
                     text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
                     raise Refusal(ErrorCode.TIMEOUT, text + unusable)
                 try:
