@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
+from dm_calibration.hysteresis.hysteresis_fit import MAPS_BEYOND, fit_hysteresis
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
@@ -17,16 +17,15 @@ from dm_common.mirror import Mirror
 
 #: A run no longer improves if this number of parts together lowers the error by less than this share.
 STANDSTILL_PARTS, STANDSTILL = 2, 0.05
+#: Power with which the error grows where the maps are few: the median of five mirrors (seeds 7646, 7650, 7655, 7684 and
+#: 7688) was 55 nm after 90 maps, 9.4, 7.1 and 2.2 nm after 112, 133 and 216.
+FEWER = 3
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
 #: Error of moves after a run of one map per actuator, for a mirror never calibrated, m, as in :attr:`LawError.first`.
 #: Median of 29 mirrors drawn at random (seeds 7646 to 7675 without 7650): 1.5 nm after 314 maps. One mirror in ten
 #: reached only 3.0 nm.
 TYPICAL_LAW = 4.5e-9
-#: Number of maps beyond that of the actuators (152 maps for 37) below which the error grows with the third power: the
-#: median of five mirrors (seeds 7646, 7650, 7655, 7684, 7688) was 39 nm after 90 maps, 6.7, 5.7 and 2.2 nm after 112,
-#: 133 and 216.
-FEW_BEYOND, FEWER = 115, 3
 #: If the error in a run exceeds the typical one by more than this factor, the law has probably not been found yet.
 WORST_LAW = 2.2
 
@@ -76,7 +75,7 @@ class LawError:
 
     def after(self, maps: int) -> float:
         """m, after `maps` maps."""
-        few = max(1.0, FEW_BEYOND / max(maps - self.own, 1)) ** FEWER if self.own else 1.0
+        few = max(1.0, MAPS_BEYOND / max(maps - self.own, 1)) ** FEWER if self.own else 1.0
         return float(self.first * few / np.sqrt(maps))
 
 
