@@ -171,11 +171,8 @@ def test_the_promise_is_what_requests_will_be_told(
 
 
 def test_a_worse_calibration_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
-    show_result(Calibrate.Result(id="c2", message="90 maps, residual 1 nm; warning: it promises 338 nm, c1 2.3 nm"))
+    show_result(Calibrate.Result(id="c2", warning="warning: it promises 338 nm, c1 2.3 nm"))
     assert "warning: it promises 338 nm, c1 2.3 nm" in capsys.readouterr().out
-    both = "warning: c2 is in use, but could not be noted for the next start: disk full; warning: it promises 338 nm"
-    show_result(Calibrate.Result(id="c2", message=f"90 maps, residual 1 nm; {both}"))
-    assert both in capsys.readouterr().out
 
 
 def test_what_a_run_does_not_have_is_no_zero() -> None:

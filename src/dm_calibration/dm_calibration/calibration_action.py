@@ -262,11 +262,11 @@ class CalibrateAction:
         result.file = str(file)
         run.journal.remove()
         result.id = calibration.id
-        warning = self._manager.use(calibration) if goal.activate else ""
+        result.warning = self._manager.use(calibration) if goal.activate else ""
         wrong = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
         residuals = f"{fit.in_sample_rms * 1e9:.2f} nm in sample, {fit.held_out_rms * 1e9:.2f} nm held out{wrong}"
         reached = enough.sentence(result.hysteresis_held_out_max_zernike) if goal.until else ""
-        result.message = "; ".join(filter(None, (f"{result.maps} maps, residual {residuals}", reached, warning)))
+        result.message = "; ".join(filter(None, (f"{result.maps} maps, residual {residuals}", reached, result.warning)))
 
     def _calibration(self, run: OpenRun) -> Calibration:
         """The calibration that follows from the maps of the run."""

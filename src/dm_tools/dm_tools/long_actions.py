@@ -24,11 +24,6 @@ LONG = ("build_recipes", "calibrate", "converge")
 RUNNING = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 
 
-def warning_in(result: Any) -> str:
-    """The warnings in the message of a Calibrate result; "" = none."""
-    return "; ".join(part for part in result.message.split("; ") if part.startswith("warning: "))
-
-
 class ExternalGoals:
     """Follows all goals of one action by its status and feedback topics. May be queried from any thread.
 

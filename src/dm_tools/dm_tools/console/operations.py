@@ -15,7 +15,6 @@ from dm_common.optics.zernike import rms_beyond_tilt
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import poke_signals, prediction_text
-from dm_tools.long_actions import warning_in
 
 #: Wait between a command and its map, s: the default of the calibration's `settle_time`.
 SETTLE_S = 0.5
@@ -75,7 +74,7 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
     if result.poke_check_passed:
         findings = " Poke check passed: wiring and orientation are as configured."
     made = f"{result.id}: held-out residual {result.held_out_rms * 1e9:.1f} nm rms. " if result.id else ""
-    return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings} {warning_in(result)}".rstrip()
+    return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings} {result.warning}".rstrip()
 
 
 async def estimate(session: Session, goal: Calibrate.Goal) -> str:

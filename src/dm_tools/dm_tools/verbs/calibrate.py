@@ -98,8 +98,6 @@ def made_by(client: Any, result: Any) -> Any:
 
 def show_result(result: Any, calibration: Any = None) -> None:
     """Print a calibration's figures and everything a person should know about it; `calibration`: see `made_by`."""
-    from dm_tools.long_actions import warning_in
-
     if result.id:
         console.print(
             f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
@@ -117,8 +115,8 @@ def show_result(result: Any, calibration: Any = None) -> None:
         )
     if calibration is not None:
         console.print(f"when flat: {accuracy_text(promise_of(calibration), calibration, 0.0)}")
-    if warning := warning_in(result):
-        console.print(f"[yellow]{warning}[/]")
+    if result.warning:
+        console.print(f"[yellow]{result.warning}[/]")
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
     for entry in result.poke_findings:
