@@ -239,9 +239,11 @@ def test_poke_check_names_what_differs(start: Callable[..., NodeProcess], observ
     assert list(result.poke_findings) == ["actuators 3 and 7 are exchanged"]
     assert not result.poke_check_passed and not list(folder.glob("*.h5"))
     assert (bench.signals == 0.0).all()
-    # A calibration is stored all the same, with the finding in it.
+    # A calibration is stored all the same, with the finding in it, and used, with a warning if this cannot be noted.
+    (folder / "in_use_T-1.txt").mkdir()
     result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
     assert result.error_code == ErrorCode.OK and not result.poke_check_passed
+    assert "could not be noted" in result.warning and result.warning in result.message
     wait_until(lambda: received[-1].id == result.id, 60)
     assert any("actuators 3 and 7 are exchanged" in sentence for sentence in received[-1].known_limitations)
 

@@ -68,7 +68,7 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
     )
     fewer = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=120))
     assert forecast(fewer, 0.5, None, mirror).max_zernike == pytest.approx(2.4e-9 * (120 / 95) ** 3, rel=0.1)
-    # As the run then promises, which must tell the laws of all actuators: 2.9 nm was told, 93 promised.
+    # So few maps hardly tell the laws of all actuators apart: 2.9 nm was told before a run that then promised 93.
     few = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=80))
     assert forecast(few, 0.5, None, mirror).max_zernike == pytest.approx(2.9e-9 * (120 / 53) ** 3, rel=0.1)
 

@@ -56,6 +56,8 @@ ENCODINGS: dict[str, _Layout] = {
 }
 #: Share of pixels with the largest value from which on the exposure counts as faulty.
 CLIPPED = 0.2
+#: Smallest share of brighter pixels with which an image of grey levels 0 and 1 is not almost black.
+HOT_PIXELS = 1e-3
 #: Longest time by which an exposure may seem to begin after its image has arrived [s], as clocks agree only roughly;
 #: and with a simulated clock, which only ticks now and then.
 STAMP_AHEAD, STAMP_AHEAD_SIMULATED = 0.05, 0.5
@@ -161,8 +163,8 @@ def exposure_fault(image: NDArray) -> str:
     top = np.fmax.reduce(image, axis=None)  # leaves NaN out
     if not top > 0:
         return "the image is black"
-    if image.dtype.kind == "u" and image.mean() < 1:  # noise and hot pixels; numbers of other types have any scale
-        return f"the image is almost black: its mean grey level is {image.mean():.2g}"
+    if image.dtype.kind == "u" and np.mean(image > 1) < HOT_PIXELS:  # numbers of other types have any scale
+        return "the image is almost black: its grey levels are 0 and 1, except for a few hot pixels"
     share = float(np.mean(image == top))
     if share < CLIPPED:
         return ""

@@ -195,9 +195,11 @@ def test_an_unknown_encoding_is_named(encoding: str) -> None:
 def test_wrong_exposures_are_named() -> None:
     clipped = np.minimum(2 * texture(), 255).astype("u1")
     assert exposure_fault(np.zeros((4, 4), "u1")) == exposure_fault(np.full((4, 4), np.nan)) == "the image is black"
-    noise = np.zeros((20, 20), "u1")
+    noise = np.zeros((40, 50), "u1")
     noise[::4, ::5], noise[7, 7] = 1, 200  # read noise that rarely reaches the first grey level, and a hot pixel
-    assert exposure_fault(noise) == "the image is almost black: its mean grey level is 0.55"
+    assert exposure_fault(noise).startswith("the image is almost black: ")
+    noise[10:12, 10:12] = 200  # a star is no fault
+    assert exposure_fault(noise) == ""
     assert "have the largest value, 1" in exposure_fault(np.array([[np.nan, 1.0, 1.0, 0.0]]))
     assert "have the largest value, 255" in exposure_fault(clipped + (255 - clipped) * (clipped > 180))
     assert exposure_fault(texture().astype("u1")) == exposure_fault(texture().astype("f4")) == ""

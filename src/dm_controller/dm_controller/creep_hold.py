@@ -43,7 +43,7 @@ class CreepHold:
         self._values, self._monitor = values, monitor
         self.corrections = 0
         self.ended = ""
-        self._refused = int(ErrorCode.OK)  # by the driver: why, of the last correction
+        self._told_of = int(ErrorCode.OK)  # the driver's refusal that was logged since a correction was taken
 
     @property
     def active(self) -> bool:
@@ -87,7 +87,7 @@ class CreepHold:
     def command(self, estimate: ActuatorEstimate, now: Moment) -> list[Effect]:
         """The corrections that are due for the shape, by the driver's last report and the estimate for `now`.
 
-        They are sent again as long as the driver refuses them, which is logged once.
+        They are sent again until the driver takes one; a refusal, perhaps of another client's command, is logged once.
         """
         order, report = self._monitor.order, self._monitor.latest
         if order is None or not order.creep_held or report is None or report.moving:
@@ -96,9 +96,13 @@ class CreepHold:
             return []  # goes on afterwards if the holder leaves the shape as it is
         if (signals := self.correction(estimate, now.time)) is None:
             return []
-        before, self._refused = self._refused, 0 if order.sent[-1].confirmed else report.error_code
-        text = f"a correction for creep was not taken; the driver says: {report.message}"
-        news: list[Effect] = [Log("warning", text)] if self._refused not in (ErrorCode.OK, before) else []
+        news: list[Effect] = []
+        if order.sent[-1].confirmed:
+            self._told_of = int(ErrorCode.OK)
+        elif report.error_code not in (ErrorCode.OK, self._told_of):
+            self._told_of = report.error_code
+            text = f"a correction for creep was not taken; the driver's last refusal: {report.message}"
+            news.append(Log("warning", text))
         return [*news, order.send(signals, now, report.turns)]
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:

@@ -66,7 +66,7 @@ class LawError:
     """Error of moves by the number of maps, as `HysteresisFit.held_out_max_zernike`.
 
     Attributes:
-        first: m, after one map, if these were not few; it falls with the root of their number.
+        first: m, extrapolated to one map from runs of many, by the root of their number.
         own: number of actuators with laws of their own, for which maps can be few; 0 = one law for all.
     """
 

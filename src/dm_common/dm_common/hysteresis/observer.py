@@ -286,9 +286,9 @@ class HysteresisObserver:
 
 def _between(before: Applied, between: Applied, after: Applied) -> bool:
     """Whether a law needs no report of `between`, because it lies within one move or one rest."""
-    if not _phase(before) == _phase(between) == _phase(after) or after.counts_anew(between):
-        return False
-    return before.time <= between.time <= after.time and (between.moving or between.time == after.time)
+    anew = between.counts_anew(before) or after.counts_anew(between)
+    one = not anew and _phase(before) == _phase(between) == _phase(after)
+    return one and before.time <= between.time <= after.time and (between.moving or between.time == after.time)
 
 
 def _same(last: Applied, report: Applied) -> bool:
