@@ -12,6 +12,7 @@ from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate, check_fit
 from dm_calibration.hysteresis.excitation import fewest_maps
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
@@ -118,7 +119,7 @@ class CalibrateAction:
         result, run = self._result, self._opened(runs)
         enough = GoodEnough(
             self._goal.until,
-            lambda reached: self._report_reached(reached, run.outcome.measured),
+            lambda found: self._report_reached(found, run.outcome.measured),
             self._mirror.limits,
         )
         procedure = self._procedure(run, enough)
@@ -212,13 +213,14 @@ class CalibrateAction:
         phase = _PHASES.get(now.kind, self._feedback.phase) if now.done else "degauss"
         self._report(phase, now.label, now.done)
 
-    def _report_reached(self, reached: float, maps: int) -> None:
-        """Report the error `reached` (m) after `maps` maps, and estimate the remaining steps."""
-        feedback = self._feedback
+    def _report_reached(self, found: HysteresisFit, maps: int) -> None:
+        """Report the error of the law `found` after `maps` maps, and estimate the remaining steps."""
+        feedback, reached = self._feedback, found.held_out_max_zernike
         feedback.reached_max_zernike = reached
         law = law_error(self._manager.in_use, self._mirror)
         step, until = feedback.step, self._goal.until
-        self._end, feedback.expected_max_zernike = expected_end(self._plan, step, reached, until, law)
+        own = found.law.actuators
+        self._end, feedback.expected_max_zernike = expected_end(self._plan, step, reached, until, law, own)
         self._node.get_logger().info(f"{maps} maps: accurate to {reached * 1e9:.2f} nm")
 
     def _conclude(self, run: OpenRun, runs: UnfinishedRuns, enough: GoodEnough) -> None:

@@ -127,9 +127,13 @@ def _without_outliers(run: Run, test: Bools, candidates: Sequence[Candidate]) ->
 
 def _few_maps(found: Identification, run: Run) -> float:
     """Factor on the error of held-out moves if the maps are few for laws of each actuator, at least 1."""
-    if not (found.fit.candidate.own and found.fit.candidate.hysteretic):
-        return 1.0
-    return max(1.0, MAPS_BEYOND / max(int(run.responses.usable.sum()) - run.signals.shape[1], 1))
+    own = found.fit.candidate.own and found.fit.candidate.hysteretic
+    return few_maps(int(run.responses.usable.sum()), run.signals.shape[1] if own else 0)
+
+
+def few_maps(maps: int, own: int) -> float:
+    """Factor on the error of held-out moves if `maps` are few for laws of `own` actuators (0 = one law for all)."""
+    return max(1.0, MAPS_BEYOND / max(maps - own, 1)) if own else 1.0
 
 
 def _held(found: Identification, maps: MapSet) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.hysteresis_fit import MAPS_BEYOND, fit_hysteresis
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, few_maps, fit_hysteresis
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, Step, StepKind
@@ -75,8 +75,7 @@ class LawError:
 
     def after(self, maps: int) -> float:
         """m, after `maps` maps."""
-        few = max(1.0, MAPS_BEYOND / max(maps - self.own, 1)) ** FEWER if self.own else 1.0
-        return float(self.first * few / np.sqrt(maps))
+        return float(self.first * few_maps(maps, self.own) ** FEWER / np.sqrt(maps))
 
 
 def forecast(
@@ -136,21 +135,23 @@ def law_error(earlier: Calibration | None, mirror: Mirror) -> LawError:
     return replace(falls, first=found.held_out_max_zernike / falls.after(found.maps))
 
 
-def expected_end(plan: Plan, done: int, reached: float, until: float, law: LawError) -> tuple[int, float]:
+def expected_end(plan: Plan, done: int, reached: float, until: float, law: LawError, own: int = 0) -> tuple[int, float]:
     """The number of steps of `plan` after which the error `until` (m) is expected, or all, and the error expected then.
 
     The error falls suddenly when the law is found, at a time that cannot be predicted; before, the expected error is 0
-    (not known). From then on it is inversely proportional to the root of the number of maps: `reached` may be that of a
-    law common to all actuators, without a factor for few maps.
+    (not known). From then on it is inversely proportional to the root of the number of maps, besides the factor for few
+    maps, which `reached` includes if it is that of `own` laws.
 
     Args:
         done: steps so far.
         reached: error after these, m.
+        own: number of actuators with laws of their own in the fit that reached it; 0 = one law for all.
     """
+    reached /= few_maps(done, own)
     if reached > WORST_LAW * law.first / np.sqrt(done):
         return len(plan.steps), 0.0
     ends = [*(end for end in sorted(plan.ends) if end > done + 1), len(plan.steps)]
-    expected = [reached * np.sqrt(done / end) for end in ends]
+    expected = [reached * few_maps(end, own) * np.sqrt(done / end) for end in ends]
     k = next((k for k, value in enumerate(expected) if value <= until), -1)
     return ends[k], float(expected[k])
 
@@ -160,7 +161,7 @@ class GoodEnough:
 
     Args:
         until: m, as `HysteresisFit.held_out_max_zernike`.
-        report: called with the error reached after each part of the run, m.
+        report: called with what is found after each part of the run.
         limits: of the signals, as for :func:`~dm_calibration.hysteresis.hysteresis_fit.fit_hysteresis`.
 
     Attributes:
@@ -168,19 +169,19 @@ class GoodEnough:
     """
 
     def __init__(
-        self, until: float, report: Callable[[float], None] = lambda reached: None, limits: Limits | None = None
+        self, until: float, report: Callable[[HysteresisFit], None] = lambda found: None, limits: Limits | None = None
     ) -> None:
         self._until, self._report, self._limits = until, report, limits
         self.reached: list[float] = []
 
     def __call__(self, outcome: Outcome) -> bool:
         try:
-            found = fit_hysteresis(outcome.maps(), limits=self._limits).held_out_max_zernike
+            found = fit_hysteresis(outcome.maps(), limits=self._limits)
         except TooFewMapsError:
             return False
-        self.reached.append(found)
+        self.reached.append(found.held_out_max_zernike)
         self._report(found)
-        return found <= self._until or self._no_longer_better
+        return self.reached[-1] <= self._until or self._no_longer_better
 
     @property
     def _no_longer_better(self) -> bool:
