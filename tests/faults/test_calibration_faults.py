@@ -186,6 +186,7 @@ def test_cancelled_and_started_again_it_goes_on(rig: Rig) -> None:
     cancelled = future.result()
     assert cancelled.status == GoalStatus.STATUS_CANCELED
     assert "maps are kept in" in cancelled.result.message and "the mirror is back" in cancelled.result.message
+    assert "`./dm calibrate --fresh`" in cancelled.result.message
     seen: list[Any] = []
     _, again = rig.send(feedback=lambda message: seen.append(message.feedback.label))
     wait_until(again.done, PATIENCE_S)

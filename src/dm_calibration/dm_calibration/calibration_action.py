@@ -139,7 +139,7 @@ class CalibrateAction:
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (
                 f"{counted(run.outcome.measured, 'map is', 'maps are')} kept in {run.journal.folder}: the same goal "
-                "resumes from there, `dm calibrate --fresh` begins anew"
+                "resumes from there, `./dm calibrate --fresh` begins anew"
             )
         result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
 

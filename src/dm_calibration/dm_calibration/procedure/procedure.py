@@ -250,7 +250,7 @@ class Procedure:
             raise Refusal(
                 ErrorCode.MAP_REJECTED,
                 f"{label}: {suspicion}: the mirror is not where it was before the run was interrupted. Put it back, "
-                "or begin anew (`dm calibrate --fresh`)",
+                "or begin anew (`./dm calibrate --fresh`)",
             )
         records = self.outcome.records
         kept = max(index for index, record in enumerate(records, 1) if record.kind == StepKind.REFERENCE)
