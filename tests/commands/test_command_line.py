@@ -34,7 +34,7 @@ from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
-from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
+from dm_tools.running_suite import REPORT_S, SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs import check
 from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
@@ -373,6 +373,32 @@ def test_a_map_is_held_against_what_is_promised_beyond_the_prediction(
     assert said.exit_code == code, said.output
     assert f"largest coefficient beyond what is predicted: promised {promised:g} nm (95 % bound" in said.output
     assert json.loads((tmp_path / "figures").read_text())["check"]["promised_nm"] == pytest.approx(promised)
+
+
+def test_a_controller_that_is_found_late_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its nodes are found one by one; with the bound of the calibration a good map may be called outside."""
+    values = {"curvature": 0.03, "age": "4.0", "predicted": 0.0, "bound": 30e-9, "held": True, "conditioned": False}
+    pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
+    waited: list[float] = []
+    health: dict[str, Any] = {}
+
+    def wait(condition: Callable[[], object], timeout_s: float) -> bool:
+        waited.append(timeout_s)
+        if sum(waited) > REPORT_S:
+            health["focus_controller"] = SimpleNamespace(values=pairs)
+        return bool(condition())
+
+    client = SimpleNamespace(
+        update_calibration=lambda **_options: UpdateCalibration.Response(accepted=True, max_zernike=20e-9),
+        latest=lambda _name: Calibration(id="c1"),
+        messages={"capabilities": Capabilities(error_bound=18e-9)},
+        wait=wait,
+    )
+    monkeypatch.setattr(check, "running_suite", lambda _namespace: nullcontext(client))
+    monkeypatch.setattr(check, "nodes_of_suite", lambda _client: {"focus_controller": len(waited)})
+    monkeypatch.setattr(check, "receive_health", lambda _client: health)
+    said = CliRunner().invoke(cli.make_app(), ["check"])
+    assert said.exit_code == 0 and "promised 30 nm (95 % bound), measured 20 nm: inside" in said.output
 
 
 def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:

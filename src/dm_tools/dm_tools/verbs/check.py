@@ -48,12 +48,16 @@ def check(
         raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
         health = receive_health(client)
+
+        def heard() -> bool:
+            return "focus_controller" in health and "capabilities" in client.messages
+
         # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
         # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
         # another surface than the model predicts, so for a conditioned shape the model's bound counts where it is
         # larger: it holds no creep.
-        patience = BUSY_S if nodes_of_suite(client)["focus_controller"] else REPORT_S
-        client.wait(lambda: "focus_controller" in health and "capabilities" in client.messages, patience)
+        if not client.wait(heard, REPORT_S) and nodes_of_suite(client)["focus_controller"]:  # not found at first
+            client.wait(heard, BUSY_S - REPORT_S)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
