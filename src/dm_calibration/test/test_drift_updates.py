@@ -370,6 +370,21 @@ def test_an_actuator_that_was_dead_when_calibrated_and_moves_is_named(tmp_path: 
     assert reason.endswith("%); ./dm calibrate measures it")
 
 
+def test_where_another_one_sticks_than_was_given_up_the_map_names_that_alone(
+    bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    """The one given up was named too, with the place that the map would show it at if it alone were displaced."""
+    settled, at = bench.settled(), bench.signals.copy()
+    at[6] = -1.0
+    bench.apply(at)
+    map_ = bench.measure("stuck")
+    alone = updates.take(map_, settled, dry_run=True)
+    verdict = updates.take(map_, settled, without=[7])
+    assert not verdict.accepted and not known(updates).given_up
+    assert "./dm check --without 7 continues without" in verdict.reason and "actuator 8" not in verdict.reason
+    assert verdict.comparison.max_zernike == alone.comparison.max_zernike
+
+
 def test_an_actuator_that_stands_where_it_should_is_not_given_up(
     bench: SteadyMirror, updates: RecalibrationManager
 ) -> None:

@@ -177,7 +177,7 @@ class RecalibrationManager:
             calibration, before = kept.calibration, kept.drift
             check_map(measured, calibration, options)
             stamp, checked = (int(min(time, now_ns)) for time in (before.stamp_ns, before.checked_ns))
-            updates = replace(before, stamp_ns=stamp, checked_ns=checked)
+            updates = all_in_use = replace(before, stamp_ns=stamp, checked_ns=checked)
             if settled.effective.shape != (calibration.fit.actuators,):
                 raise MapNotUsableError(
                     f"the mirror has {settled.effective.size} signals, the calibration {calibration.fit.actuators} "
@@ -188,6 +188,9 @@ class RecalibrationManager:
                 updates = kept.filter.give_up(updates, sorted(set(without)), measured, settled.effective, repeat)
             comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             accepted = comparison.surprise <= options.surprise_max
+            if without and not accepted:  # they stay in use
+                updates = all_in_use
+                comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             reason = f"differs from the prediction by {comparison.surprise:.1f} times the expected difference"
             found = comparison.displaced, updates.reached(settled.effective)
             causes = described(*found, np.isfinite(kept.drift.stuck), without_response(calibration))
