@@ -14,9 +14,11 @@ from dm_calibration.procedure.forecast import (
     TYPICAL_DEGAUSS_S,
     Forecast,
     GoodEnough,
+    degauss_time,
     expected_end,
     forecast,
     law_error,
+    step_times,
 )
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, Step, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -83,6 +85,18 @@ def test_what_is_left_follows_from_what_is_reached() -> None:
     assert all(expected_end(plan, first - 1, 3e-9, 3e-9 * (first / other) ** 0.5, law)[0] == other for other in ends)
     end, expected = expected_end(plan, first - 1, 3e-9, 1e-10, law)
     assert end == len(plan.steps) and 1e-9 < expected < 2e-9
+
+
+def test_time_includes_the_fits_between_parts_and_the_slew_rate() -> None:
+    """177 s were told and 277 needed: three fits of 16 to 20 s, and five degausses of 11 s each that counted as 5."""
+    mirror = make_mirror(rings=3)
+    plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=420, until=3e-9))
+    slow = degauss_time({"slew_rate_max": 10.0})
+    assert (degauss_time({}), degauss_time({"slew_rate_max": 40.0}), slow) == (TYPICAL_DEGAUSS_S, 2.5, 10.0)
+    found = forecast(plan, 0.5, None, mirror, map_time=0.23, until=3e-9, degauss=slow)
+    assert found.maps == 174 and found.duration == pytest.approx(277.0, rel=0.15)
+    fourth = sorted(plan.ends)[3]
+    assert step_times(plan, 0.5, 0.23, slow, 20.0)[fourth] - step_times(plan, 0.5, 0.23, slow, 0.0)[fourth] == 20.0
 
 
 def test_before_the_law_is_found_nothing_is_expected() -> None:

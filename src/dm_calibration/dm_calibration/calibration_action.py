@@ -16,7 +16,14 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, law_error, step_times
+from dm_calibration.procedure.forecast import (
+    GoodEnough,
+    degauss_time,
+    expected_end,
+    forecast,
+    law_error,
+    step_times,
+)
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import LAST_PART_ENDS, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
@@ -106,7 +113,8 @@ class CalibrateAction:
         goal, plan, result = self._goal, self._plan, self._result
         in_use, taken, guessed = self._manager.in_use, self._services.map_time, self._values["map_time"]
         settle_time = goal.settle_time or self._values["settle_time"]
-        expected = forecast(plan, settle_time, in_use, self._mirror, taken, goal.until, guessed)
+        degauss = degauss_time(self._manager.driver_facts)
+        expected = forecast(plan, settle_time, in_use, self._mirror, taken, goal.until, guessed, degauss)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.takes_map for step in plan.steps)
@@ -117,7 +125,7 @@ class CalibrateAction:
     def _run_kept(self, runs: UnfinishedRuns) -> None:
         """Begin or resume a run, store each map at once, and conclude. Fills the result, even after a failure."""
         result, run = self._result, self._opened(runs)
-        enough = GoodEnough(
+        self._enough = enough = GoodEnough(
             self._goal.until,
             lambda found: self._report_reached(found, run.outcome.measured),
             self._mirror.limits,
@@ -202,9 +210,11 @@ class CalibrateAction:
     def _report(self, phase: str, label: str, step: int) -> None:
         feedback = self._feedback
         feedback.phase, feedback.label, feedback.step = phase, label, step
-        left = self._plan.steps[step : self._end]
-        feedback.maps_left = sum(each.takes_map for each in left)
-        feedback.time_left = float(step_times(left, self._services.settle_time, self._services.map_time).sum())
+        left, services = slice(step, self._end), self._services
+        feedback.maps_left = sum(each.takes_map for each in self._plan.steps[left])
+        degauss, fit = degauss_time(self._manager.driver_facts), self._enough.fit_time
+        times = step_times(self._plan, services.settle_time, services.map_time, degauss, fit)
+        feedback.time_left = float(times[left].sum())
         self._handle.publish_feedback(feedback)
 
     def _report_progress(self, now: Progress) -> None:

@@ -1,7 +1,9 @@
 """Duration and accuracy of a hysteresis plan, estimated before anything moves."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, few_maps, fit_hysteresis
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
-from dm_calibration.procedure.plan import Plan, Step, StepKind
+from dm_calibration.procedure.plan import Plan, StepKind
 from dm_common import Floats
 from dm_common.figures import distinct_from, in_nanometres, rounded
 from dm_common.limits import Limits
@@ -22,6 +24,10 @@ STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 FEWER = 3
 #: A degauss of 100 half-swings takes 2.5 s on the simulation, 10 s at the slew rate that ships for hardware.
 TYPICAL_DEGAUSS_S = 5.0
+#: Range that a degauss of 100 half-swings travels, normalised.
+DEGAUSS_TRAVEL = 100.0
+#: A fit after a part of a run with `until` took 12 to 25 s of one core for 37 actuators and 90 to 400 maps.
+TYPICAL_FIT_S = 18.0
 #: Error of moves after a run of one map per actuator, for a mirror never calibrated, m, as in :attr:`LawError.first`.
 #: Median of 29 mirrors drawn at random (seeds 7646 to 7675 without 7650): 1.5 nm after 314 maps. One mirror in ten
 #: reached only 3.0 nm.
@@ -86,6 +92,7 @@ def forecast(
     map_time: float = 0.0,
     until: float = 0.0,
     guessed: float = 1.0,
+    degauss: float = TYPICAL_DEGAUSS_S,
 ) -> Forecast:
     """Expected duration and accuracy of `plan`; accuracy only of hysteresis plans.
 
@@ -95,6 +102,7 @@ def forecast(
         map_time: s that the last map took; 0 = none was taken: estimated from `earlier`, else `guessed`.
         until: accuracy at which the run ends, m, if its plan may end early.
         guessed: s per map if nothing else is known.
+        degauss: s that a degauss takes.
     """
     if not map_time:
         map_time = guessed
@@ -102,27 +110,39 @@ def forecast(
             gap = np.diff(np.sort(earlier.maps.stamp_ns)) * 1e-9
             map_time = max(float(np.median(gap)) - settle_time, 0.0)
     measured = np.array([step.takes_map for step in plan.steps], dtype=bool)
-    time = np.cumsum(step_times(plan.steps, settle_time, map_time))[measured]
-    duration = float(time[-1]) if len(time) else 0.0
+    times = np.cumsum(step_times(plan, settle_time, map_time, degauss, TYPICAL_FIT_S))[measured]
+    duration = float(times[-1]) if len(times) else 0.0
     expected = Forecast(duration, 0.0)
     tested = any(step.kind is StepKind.CHECK for step in plan.steps)
     typical = earlier is None or earlier.hysteresis is None
     if not tested or (typical and mirror.actuators < 2):  # the typical figure is of mirrors with many actuators
         return expected
     law = law_error(earlier, mirror)
-    for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(time)):
-        expected = Forecast(float(time[part - 1]), law.after(part), part, typical)
+    for part in (*(int(measured[:end].sum()) for end in sorted(plan.ends)), len(times)):
+        expected = Forecast(float(times[part - 1]), law.after(part), part, typical)
         if expected.max_zernike <= until:
             break
     return expected
 
 
-def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Floats:
-    """Duration of each of `steps`, s, if a map takes `map_time` (s) beyond the settle time."""
+def degauss_time(driver_facts: Mapping[str, Any]) -> float:
+    """Expected duration of a degauss of 100 half-swings, s, with a driver of these facts."""
+    slew_rate = driver_facts.get("slew_rate_max")
+    return DEGAUSS_TRAVEL / slew_rate if slew_rate else TYPICAL_DEGAUSS_S
+
+
+def step_times(plan: Plan, settle_time: float, map_time: float, degauss: float, fit_time: float) -> Floats:
+    """Duration of each step of `plan`, s; a step at which the plan may end begins with a fit.
+
+    Args:
+        map_time: s per map beyond the `settle_time`.
+        degauss, fit_time: s per degauss, and per fit.
+    """
     return np.array(
         [
-            map_time + step.settle_share * settle_time + step.dwell if step.takes_map else TYPICAL_DEGAUSS_S
-            for step in steps
+            (map_time + step.settle_share * settle_time + step.dwell if step.takes_map else degauss)
+            + fit_time * (number in plan.ends)
+            for number, step in enumerate(plan.steps)
         ]
     )
 
@@ -166,6 +186,7 @@ class GoodEnough:
 
     Attributes:
         reached: error after each part, m.
+        fit_time: s that the last fit took, at first a typical time.
     """
 
     def __init__(
@@ -173,12 +194,15 @@ class GoodEnough:
     ) -> None:
         self._until, self._report, self._limits = until, report, limits
         self.reached: list[float] = []
+        self.fit_time = TYPICAL_FIT_S
 
     def __call__(self, outcome: Outcome) -> bool:
+        began = time.monotonic()
         try:
             found = fit_hysteresis(outcome.maps(), limits=self._limits)
         except TooFewMapsError:
             return False
+        self.fit_time = time.monotonic() - began
         self.reached.append(found.held_out_max_zernike)
         self._report(found)
         return self.reached[-1] <= self._until or self._no_longer_better
