@@ -364,7 +364,7 @@ def test_a_run_killed_while_it_was_stored_measures_no_more(tmp_path: Path, monke
     concluded: list[OpenRun] = []
     services = SimpleNamespace(rest=lambda _signals: "", settle_time=0.0, map_time=0.0)
     handle = SimpleNamespace(request=Calibrate.Goal(), publish_feedback=lambda _feedback: None)
-    manager = SimpleNamespace(known_mirror=lambda: MIRROR)
+    manager = SimpleNamespace(known_mirror=lambda: MIRROR, driver_facts={})
     action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, handle)  # type: ignore[arg-type]
     action._plan, action._mirror = POKES, MIRROR
     unmoved = SimpleNamespace(run=lambda: pytest.fail("the procedure runs again"))
