@@ -1,9 +1,8 @@
 """Geometry, limits and numbers of the actuators of a mirror, reports of its driver, which calibration belongs to it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
@@ -136,6 +135,6 @@ class Applied:
     heard: float = -np.inf
     sequence: int = 0
 
-    def counts_anew(self, last: Applied) -> bool:
+    def counts_anew(self, last: Self) -> bool:
         """Whether the driver was activated anew since the report `last`."""
         return self.turns < last.turns or self.degausses < last.degausses or self.sequence < last.sequence
