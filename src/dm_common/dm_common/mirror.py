@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Self
+from typing import Any
 
 import numpy as np
 
@@ -135,6 +135,10 @@ class Applied:
     heard: float = -np.inf
     sequence: int = 0
 
-    def counts_anew(self, last: Self) -> bool:
-        """Whether the driver was activated anew since the report `last`."""
-        return self.turns < last.turns or self.degausses < last.degausses or self.sequence < last.sequence
+
+def counts_anew(report: Any, last: Any) -> bool:
+    """Whether the driver was activated anew between the reports `last` and `report`, Applied or dm_msgs/ActuatorState.
+
+    It may be heard only once one of its counts has passed that of before.
+    """
+    return any(getattr(report, name) < getattr(last, name) for name in ("sequence", "turns", "degausses"))

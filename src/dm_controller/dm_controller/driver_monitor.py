@@ -17,6 +17,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import same_signals
 from dm_common.messages import driver_refusal, stamp_ns
+from dm_common.mirror import counts_anew
 from dm_controller.focus_types import Effect, Log, Moment, Order, Progress, PublishState
 
 #: States that a driver does not leave by itself, unlike a lost link.
@@ -85,7 +86,7 @@ class DriverMonitor:
         """Take the driver's next report; returns True if it is the first to make the latency known."""
         before, self.latest, self._heard = self.latest, report, now
         self.loss = ""  # a driver that reports is alive
-        anew = before is not None and report.sequence < before.sequence
+        anew = before is not None and counts_anew(report, before)
         self.starts += anew
         self._trust()
         command = self.order.command if self.order is not None else None

@@ -105,11 +105,14 @@ def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_not
     assert unconfirmed is not None and unconfirmed.error_code == ErrorCode.TIMEOUT
 
 
-def test_a_driver_that_was_started_anew_is_noticed() -> None:
+@pytest.mark.parametrize("later", [{"sequence": 2}, {"sequence": 9, "turns": 2}, {"sequence": 9, "degausses": 0}])
+def test_a_driver_that_was_started_anew_is_noticed(later: dict[str, Any]) -> None:
+    """Also if it is heard only once it has written more often than the one before."""
     driver = monitor()
-    driver.observe(report(sequence=7), BEGAN)
+    counts: dict[str, Any] = {"sequence": 7, "turns": 3, "degausses": 1}
+    driver.observe(report(**counts), BEGAN)
     assert driver.starts == 0
-    driver.observe(report(sequence=2), BEGAN)
+    driver.observe(report(**(counts | later)), BEGAN)
     assert driver.starts == 1
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from dm_common.hysteresis.creep_record import CreepRecord, held_unseen, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.mirror import Applied
+from dm_common.mirror import Applied, counts_anew
 
 #: Reports kept for a law that is identified later (a calibration run makes some hundred), estimates for late maps.
 LOG_LENGTH, ESTIMATES_KEPT = 5_000, 500
@@ -72,7 +72,7 @@ class HysteresisTracker:
         if report.time < last.time or max(report.time, report.heard) < self.state.time:
             # Hysteresis does not depend on time; creep pauses until the clock has caught up.
             self.state = replace(self.state, time=max(report.time, report.heard))
-        if report.counts_anew(last):
+        if counts_anew(report, last):
             # Best guess: since the driver was last heard, the mirror has stood at the signals that it reports now.
             self.state = self.law.move(self.state, report.signals, min(self._seen, report.time))
             self.unknown = "the driver was started or activated again"
@@ -286,7 +286,7 @@ class HysteresisObserver:
 
 def _between(before: Applied, between: Applied, after: Applied) -> bool:
     """Whether a law needs no report of `between`, because it lies within one move or one rest."""
-    anew = between.counts_anew(before) or after.counts_anew(between)
+    anew = counts_anew(between, before) or counts_anew(after, between)
     one = not anew and _phase(before) == _phase(between) == _phase(after)
     return one and before.time <= between.time <= after.time and (between.moving or between.time == after.time)
 
