@@ -1,4 +1,4 @@
-"""What `./dm measure --reference-sphere` prints, to be pasted."""
+"""What `./dm measure` prints: with --reference-sphere, to be pasted, and what to do next."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from dm_msgs.msg import Calibration, SurfaceMapInfo, ZernikeCoefficients
+from dm_msgs.srv import Measure
 from typer.testing import CliRunner
 
 from dm_common.optics.conic import conic_coefficients
-from dm_common.optics.zernike import DEFOCUS
+from dm_common.optics.zernike import DEFOCUS, SPOKEN
 from dm_tools import cli
 from dm_tools.verbs import measure
 
@@ -49,3 +51,15 @@ def test_the_map_of_a_sphere_is_published_to_nobody(sphere: bool, monkeypatch: p
     words = ["--reference-sphere", "2"] if sphere else []
     assert CliRunner().invoke(cli.make_app(), ["measure", *words]).exit_code == 1
     assert calls == [sphere]
+
+
+@pytest.mark.parametrize(("in_use", "then"), [("c1", "./dm check compares"), ("", "./dm calibrate\n")])
+def test_the_next_step_is_one_that_will_not_be_refused(in_use: str, then: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = Measure.Response(info=SurfaceMapInfo(), zernike=ZernikeCoefficients(coefficients=[0.0] * len(SPOKEN)))
+    client = SimpleNamespace(
+        measure=lambda label, answer_only: taken,
+        messages={"calibration": Calibration(id=in_use)},
+        wait=lambda condition, timeout_s: bool(condition()),
+    )
+    monkeypatch.setattr(measure, "running_suite", lambda namespace: nullcontext(client))
+    assert f"next: {then}" in CliRunner().invoke(cli.make_app(), ["measure"]).output

@@ -8,7 +8,7 @@ import typer
 from dm_common.optics.conic import pitch_of_sphere
 from dm_common.optics.zernike import DEFOCUS, PISTON_TILT, SPOKEN, curvature_of_defocus, rms_beyond_tilt
 from dm_tools.output import JsonOption, NamespaceOption, console, figures, next_step, write_json
-from dm_tools.running_suite import running_suite
+from dm_tools.running_suite import REPORT_S, latest_message, running_suite
 
 
 def measure(
@@ -29,6 +29,7 @@ def measure(
         raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
         answer = client.measure(label, answer_only=reference_sphere is not None)
+        calibration = latest_message(client, "calibration", REPORT_S)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
     radius = info.aperture_radius
     found: dict[str, Any] = {
@@ -48,7 +49,8 @@ def measure(
     if found["curvature"] is not None:
         console.print(f"defocus: that of a surface with the curvature {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}")
-    then = "./dm check compares a map with the calibration in use"
+    in_use = calibration is not None and calibration.id
+    then = "./dm check compares a map with the calibration in use" if in_use else "./dm calibrate"
     if reference_sphere is not None:
         found["pitch"] = _scale(info, coefficients, reference_sphere)
         then = "put the parameters into the parameter file; then take the sphere out"
