@@ -86,12 +86,15 @@ def test_a_fresh_start_that_was_interrupted_is_not_left_to_others(monkeypatch: p
     assert held == [True, False]
 
 
-def test_a_poke_check_that_no_parameter_puts_right_says_what_becomes_of_the_file(
+def test_a_poke_check_that_no_parameter_puts_right_says_so_once_and_what_becomes_of_the_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    findings = ["actuator 12 shows no response above the noise", "actuator 3 is weak; it reaches a tenth"]
+    message = f"resumed run r with 9 maps; {'; '.join(findings)}; the mirror is not at rest"
+
     def failed(_client: Any, _goal: Any) -> Any:
-        response = Calibrate.Result(poke_findings=["actuator 12 shows no response above the noise"])
-        raise DeformableMirrorError(ErrorCode.POKE_CHECK_FAILED, "actuator 12 shows no response", response)
+        response = Calibrate.Result(poke_findings=[*findings, "set pitch"], message=message)
+        raise DeformableMirrorError(ErrorCode.POKE_CHECK_FAILED, message, response)
 
     client = FakeClient(CalibrationMsg())
     client.mirror_info = SimpleNamespace(serial="virtual-1")  # type: ignore[attr-defined]
@@ -102,6 +105,8 @@ def test_a_poke_check_that_no_parameter_puts_right_says_what_becomes_of_the_file
     said = CliRunner().invoke(cli.make_app(), ["calibrate", "--plan", "poke-check", "--write", str(target)])
     assert "found.yaml is not written" in said.output.replace("\n", "") and not target.exists()
     assert "correct" not in said.output  # nobody knows that of a check that failed
+    assert all(said.output.count(finding) == 1 for finding in findings)
+    assert str(said.exception) == "resumed run r with 9 maps; see above; the mirror is not at rest"
     assert said.exit_code == 1
 
 

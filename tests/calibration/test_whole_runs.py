@@ -62,7 +62,7 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
     text = " ".join((done.stdout + done.stderr).split())
     assert done.returncode == 1, text
     assert "actuators 3 and 7 are exchanged" in text and "mirrored left to right, then turned by " in text
-    assert text.count("exchanged") <= 3 and "permuted" not in text, text  # a finding, and the refusal in one sentence
+    assert text.count("are exchanged") == 1 and "permuted" not in text, text
     with (
         own_domain() as domain,
         ForkedSuite(load_config(second), tmp_path, domain),

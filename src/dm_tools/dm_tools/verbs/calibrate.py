@@ -61,10 +61,7 @@ def run_calibration(client: Any, goal: Any) -> Any:
                 reached = feedback.reached_max_zernike
                 console.print(f"calibration: {reached_so_far(feedback)}")
             progress.update(
-                task,
-                total=feedback.steps or None,
-                completed=feedback.step,
-                description=f"calibration: {text}",
+                task, total=feedback.steps or None, completed=feedback.step, description=f"calibration: {text}"
             )
 
         result = client.calibrate(goal, show)
@@ -126,6 +123,12 @@ def show_result(result: Any, calibration: Any = None) -> None:
         console.print(result.parameters, markup=False)
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
+
+
+def unlisted(result: Any) -> str:
+    """The message of a failed result, without the findings that `show_result` lists."""
+    listed = [entry for entry in result.poke_findings if entry in result.message]
+    return str(result.message.replace("; ".join(listed), "see above") if listed else result.message)
 
 
 def after_run(result: Any, written: Path | None, used: bool = True) -> str:
@@ -267,15 +270,17 @@ def calibrate(
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
             nodes = nodes_of_suite(client) if source is not None else ()  # only now: at first not all are heard
-        except BaseException as error:
-            if (response := getattr(error, "response", None)) is not None:
-                show_result(response)
-                if write is not None and source is not None and response.poke_findings:
-                    write_parameters(response.parameters, write, source, namespace, nodes_of_suite(client))
+        except DeformableMirrorError as error:
+            if (response := error.response) is None:
+                raise
+            show_result(response)
+            if write is not None and source is not None and response.poke_findings:
+                write_parameters(response.parameters, write, source, namespace, nodes_of_suite(client))
+            raise DeformableMirrorError(error.error_code, unlisted(response), response) from error
+        finally:
             if fresh:  # if the run did not begin, the parameter would still be set for somebody else's goal
                 with suppress(DeformableMirrorError):
                     set_parameter(client, "calibration", "start_fresh", False)
-            raise
     if dry_run:
         console.print(result.message)
     else:
