@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dm_msgs.action import Calibrate
 
+from dm_calibration.calibration_action import CalibrateAction
 from dm_calibration.procedure.forecast import (
     TYPICAL_DEGAUSS_S,
     Forecast,
@@ -21,7 +23,7 @@ from dm_calibration.procedure.forecast import (
     step_times,
 )
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, Step, StepKind, make_plan
-from dm_calibration.procedure.procedure import Procedure
+from dm_calibration.procedure.procedure import Procedure, Progress
 from linear_mirror import make_mirror
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
@@ -143,6 +145,22 @@ def test_a_run_ends_where_it_is_good_enough() -> None:
     assert len(plan.ends) == 5 and len(enough.reached) == 1
     assert len(outcome.records) == maps_of(plan.steps[: min(plan.ends)])
     assert "200 nm is reached" in enough.sentence(enough.reached[0])
+
+
+def test_nothing_is_left_of_a_run_that_ended_early() -> None:
+    sent: list[tuple[int, int, int]] = []
+    handle = SimpleNamespace(
+        request=Calibrate.Goal(),
+        publish_feedback=lambda feedback: sent.append((feedback.step, feedback.steps, feedback.maps_left)),
+    )
+    services, manager = SimpleNamespace(settle_time=0.5, map_time=1.0), SimpleNamespace(driver_facts={})
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, manager, handle)  # type: ignore[arg-type]
+    action._plan = make_plan(PlanKind.HYSTERESIS, make_mirror(), PlanOptions(hysteresis_maps=240, until=2e-9))
+    action._enough, steps, end = GoodEnough(2e-9), len(action._plan.steps), min(action._plan.ends)
+    action._end = end + 10  # expected after the part before
+    for done, known in ((end - 1, steps), (end, end)):
+        action._report_progress(Progress("check", StepKind.CHECK, done, known, 0, 0.0))
+    assert sent == [(end - 1, steps, 11), (end, end, 0)]
 
 
 def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,7 +134,7 @@ class CalibrateAction:
         try:
             if run.storing is None:  # else all is measured, and the calibration, which may be stored, must not change
                 procedure.run()
-            self._report("fit", "fit", len(self._plan.steps))
+            self._report("fit", "fit", self._feedback.steps)
             self._conclude(run, runs, enough)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
@@ -219,6 +219,7 @@ class CalibrateAction:
 
     def _report_progress(self, now: Progress) -> None:
         self._feedback.maps_dropped, self._feedback.residual_rms = now.dropped, now.residual_rms
+        self._feedback.steps, self._end = now.steps, min(self._end, now.steps)
         # Reference frames, and a degauss within a run, belong to the phase around them.
         phase = _PHASES.get(now.kind, self._feedback.phase) if now.done else "degauss"
         self._report(phase, now.label, now.done)
@@ -268,7 +269,7 @@ class CalibrateAction:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = found.name, found.held_out_max_zernike
         if self._services.cancelled():  # during the fit; the same goal will fit the stored maps again
             raise Cancelled("cancelled")
-        self._report("store", calibration.id, len(self._plan.steps))
+        self._report("store", calibration.id, self._feedback.steps)
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
         file, calibration = self._manager.keep(calibration)
         result.file = str(file)

@@ -223,6 +223,15 @@ def test_progress_counts_the_steps(bench: LinearBench, mirror: Mirror) -> None:
     assert seen[-1].residual_rms == 2e-9
 
 
+def test_a_run_that_ends_early_has_done_the_steps_until_then(bench: LinearBench, mirror: Mirror) -> None:
+    seen: list[Progress] = []
+    plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=240, until=1e-9))
+    Procedure(plan, mirror, bench, progress=seen.append, enough=lambda outcome: True).run()
+    end = min(plan.ends)
+    assert [progress.done for progress in seen] == list(range(end + 1))
+    assert (seen[-2].steps, seen[-1].steps, seen[-1].label) == (len(plan.steps), end, plan.steps[end - 1].label)
+
+
 def test_no_maps_at_all(bench: LinearBench, mirror: Mirror) -> None:
     with pytest.raises(TooFewMapsError, match="no map was measured"):
         Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()

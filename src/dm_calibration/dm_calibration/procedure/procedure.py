@@ -57,7 +57,7 @@ class ProcedureOptions:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of the procedure: `done` of `steps` steps are done."""
+    """Progress of the procedure: `done` of `steps` steps are done; if it ends early, `steps` are those until then."""
 
     label: str
     kind: StepKind
@@ -97,6 +97,7 @@ class Procedure:
         """
         self.outcome = outcome or Outcome(remarks=list(plan.remarks))
         self._plan, self._mirror, self._bench = plan, mirror, bench
+        self._steps = len(plan.steps)  # fewer once enough are done
         self._options = options or ProcedureOptions()
         self._model = model
         self._models: dict[StepKind, LinearModel] = {}
@@ -127,9 +128,11 @@ class Procedure:
             if self._is_done(number, planned):
                 continue
             if number in self._plan.ends and self._enough(self.outcome):
+                self._steps = number
                 break
             self._do(planned, number)
-        self._report(steps[-1].label, steps[-1].kind, len(steps))
+        last = steps[self._steps - 1]
+        self._report(last.label, last.kind, self._steps)
         return self.outcome
 
     def _is_done(self, number: int, step: Step) -> bool:
@@ -166,7 +169,7 @@ class Procedure:
 
     def _report(self, label: str, kind: StepKind, done: int) -> None:
         residual_rms = self.outcome.records[-1].residual_rms if self.outcome.records else 0.0
-        self._progress(Progress(label, kind, done, len(self._plan.steps), len(self.outcome.dropped), residual_rms))
+        self._progress(Progress(label, kind, done, self._steps, len(self.outcome.dropped), residual_rms))
 
     def _checkpoint(self) -> None:
         if self._cancelled():
