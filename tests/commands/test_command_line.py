@@ -33,6 +33,7 @@ from dm_client import DeformableMirrorError
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
+from dm_tools.console.view_models import prediction_text
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import REPORT_S, SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs import check
@@ -315,11 +316,35 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
     assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     state = FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True)
     state.message = "accurate to 1.3 nm; most of that for creep"
-    _show(state, Calibration(wavelength=632.8e-9, instrument_error=4e-9, scale_error=1e-9, aperture_radius=0.011))
+    made = Calibration(wavelength=632.8e-9, instrument_error=4e-9, scale_error=1e-9, aperture_radius=0.011)
+    _show(Heard(calibration=made, mirror_info=MirrorInfo()), state)
     said = capsys.readouterr().out
     assert "promised 1.3 nm (95 % bound)" in said and "0.00 nm" not in said
     assert "\nmost of that for creep\n" in said
     assert "repeatable to 1.3 nm (λ/487), absolute to 4.2 nm (λ/150), limited by the instrument's own error" in said
+
+
+class Heard:
+    """A client that has heard the latest message on these topics."""
+
+    def __init__(self, **messages: Any) -> None:
+        self.messages = messages
+
+    def wait(self, condition: Callable[[], object], _timeout_s: float) -> bool:
+        return bool(condition())
+
+
+def test_of_signals_at_a_limit_it_is_said_at_which(capsys: pytest.CaptureFixture[str]) -> None:
+    """The end of the range counts where a signal is at both."""
+    state = FocusState(signals=[0.8, 0.2, -0.3, 0.1, -0.8], saturated=True, saturated_actuators=[1, 2, 3, 5])
+    mirror = MirrorInfo(signal_min=-0.8, signal_max=0.8)
+    saturated = "actuators 1, 5 at an end of the range, actuators 2, 3 at the limit between neighbours"
+    _show(Heard(mirror_info=mirror), state)
+    assert f"saturated: {saturated}\n" in capsys.readouterr().out
+    assert f"Saturated: {saturated}." in prediction_text(state, mirror)
+    state.saturated_actuators = [3]
+    assert "Saturated: actuator 3 at the limit between neighbours." in prediction_text(state, mirror)
+    assert "Saturated: actuator 3 at a limit." in prediction_text(state)
 
 
 def test_what_stands_is_read_from_the_controllers_health() -> None:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dm_bringup.nodes import NAMES
 from dm_common.errors import HISTORY_UNKNOWN, ErrorCode
 from dm_common.figures import distinct_from, in_nanometres
+from dm_common.limits import AT_LIMIT
+from dm_common.mirror import actuators_text
 from dm_tools.output import NotRunningError, errors
 
 if TYPE_CHECKING:
@@ -94,6 +96,16 @@ def promise_of(calibration: Any) -> float:
 
     without_law = hysteresis_model_from(calibration.hysteresis) is None
     return request_error(calibration, None if without_law else calibration.hysteresis)
+
+
+def saturation_text(state: Any, mirror: Any) -> str:
+    """Which limits the signals of a dm_msgs/FocusState are at, by actuators; `mirror`: mirror_info, None: not heard."""
+    if mirror is None:
+        return actuators_text(state.saturated_actuators, "at a limit")
+    low, high = mirror.signal_min + AT_LIMIT, mirror.signal_max - AT_LIMIT
+    inside = {number for number in state.saturated_actuators if low < state.signals[number - 1] < high}
+    at_end = actuators_text(sorted({*state.saturated_actuators} - inside), "at an end of the range")
+    return ", ".join(filter(None, (at_end, actuators_text(sorted(inside), "at the limit between neighbours"))))
 
 
 def unknown_history(capabilities: Any) -> str:

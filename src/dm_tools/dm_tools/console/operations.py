@@ -32,13 +32,14 @@ PLANS = {
 async def predict(session: Session, request: FocusRequest) -> str:
     """The prediction for a request, in words; nothing moves. Raises Refusal."""
     answer = await session.ros.call("set_focus", SetFocus.Request(request=request, dry_run=True))
-    return prediction_text(answer.state)
+    return prediction_text(answer.state, session.snapshot().mirror_info)
 
 
 async def move(session: Session, request: FocusRequest) -> str:
     """Move to the curvature of `request`."""
     result = await session.run("move_focus", MoveFocus.Goal(request=request))
-    return f"{request.curvature:+.4f} 1/m reached after {result.duration:.2f} s. {prediction_text(result.state)}"
+    predicted = prediction_text(result.state, session.snapshot().mirror_info)
+    return f"{request.curvature:+.4f} 1/m reached after {result.duration:.2f} s. {predicted}"
 
 
 async def converge(session: Session, request: FocusRequest) -> str:
@@ -51,7 +52,7 @@ async def converge(session: Session, request: FocusRequest) -> str:
 async def flatten(session: Session) -> str:
     """Make the surface flat."""
     answer = await session.ros.call("flatten", Flatten.Request())
-    return prediction_text(answer.state)
+    return prediction_text(answer.state, session.snapshot().mirror_info)
 
 
 async def degauss(session: Session) -> str:

@@ -12,8 +12,8 @@ from matplotlib.colors import to_hex
 
 from dm_common import SIGMAS_95, Floats
 from dm_common.figures import with_point
-from dm_common.mirror import actuators_text
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
+from dm_tools.running_suite import saturation_text
 
 SIGNAL_COLOURS = colormaps["cividis"]  # taken once: each time Matplotlib makes a copy, whose table it computes anew
 QUALITIES = {
@@ -183,8 +183,8 @@ def reachable(capabilities: Any) -> tuple[float, float] | None:
     return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None
 
 
-def prediction_text(state: Any) -> str:
-    """A dm_msgs/FocusState's prediction as a sentence."""
+def prediction_text(state: Any, mirror: Any = None) -> str:
+    """A dm_msgs/FocusState's prediction as a sentence; `mirror`: mirror_info, None = not heard."""
     text = (
         f"Predicted residual {state.predicted_rms * 1e9:.1f} nm rms "
         f"(95 %: {state.predicted_rms_lower * 1e9:.1f} to {state.predicted_rms_upper * 1e9:.1f} nm), "
@@ -194,7 +194,7 @@ def prediction_text(state: Any) -> str:
         text += f", shape reached after {state.predicted_duration:.2f} s"
     text += f". Mode: {MODES.get(state.mode, '?').lower()}."
     if state.saturated:
-        text += f" Saturated: {actuators_text(state.saturated_actuators)}."
+        text += f" Saturated: {saturation_text(state, mirror)}."
     if not state.history_known:
         text += " The history of the actuators is not known: a degauss would make this better."
     return text

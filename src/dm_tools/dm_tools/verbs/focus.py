@@ -5,10 +5,17 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.figures import accuracy_text, in_nanometres
-from dm_common.mirror import actuators_text
 from dm_common.optics.conic import range_text
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
-from dm_tools.running_suite import MENTIONED, REPORT_S, latest_message, naming_holder, promise, running_suite
+from dm_tools.running_suite import (
+    MENTIONED,
+    REPORT_S,
+    latest_message,
+    naming_holder,
+    promise,
+    running_suite,
+    saturation_text,
+)
 
 
 def focus(
@@ -36,7 +43,7 @@ def focus(
     with running_suite(namespace) as client, naming_holder(client):
         try:
             state = client.focus(wanted, conic, dry_run=True, mode=mode)
-            _show(state, latest_message(client, "calibration", REPORT_S))
+            _show(client, state)
             if not dry_run and wait:
                 result = client.move_focus(wanted, conic, mode=mode, take_over=take_over)
                 state = result.state
@@ -61,7 +68,7 @@ def flatten(
     """Make the surface as flat as the mirror can: curvature 0, its own figure corrected."""
     with running_suite(namespace) as client, naming_holder(client):
         state = client.flatten(dry_run=dry_run, take_over=take_over)
-        _show(state, latest_message(client, "calibration", REPORT_S))
+        _show(client, state)
     if state.applied:
         console.print(f"commanded{_held(state)}")
     write_json(json, {"focus": [figures_of(state)]})
@@ -84,8 +91,9 @@ def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", 
     next_step("./dm focus 0.02", namespace)
 
 
-def _show(state: Any, calibration: Any) -> None:
-    """Print what a dm_msgs/FocusState promises, made with this dm_msgs/Calibration, None = not known."""
+def _show(client: Any, state: Any) -> None:
+    """Print what a dm_msgs/FocusState promises."""
+    calibration, mirror = (latest_message(client, topic, REPORT_S) for topic in ("calibration", "mirror_info"))
     predicted = state.predicted_max_zernike
     predicted_part = f", of which {in_nanometres(predicted)} are predicted" if predicted >= MENTIONED else ""
     console.print(
@@ -96,7 +104,7 @@ def _show(state: Any, calibration: Any) -> None:
     if calibration is not None:
         console.print(accuracy_text(state.predicted_max_zernike_upper - predicted, calibration, state.curvature))
     if state.saturated:
-        console.print(f"[yellow]saturated[/]: {actuators_text(state.saturated_actuators)} at a limit")
+        console.print(f"[yellow]saturated[/]: {saturation_text(state, mirror)}")
     if remarks := state.message.partition("; ")[2]:
         console.print(remarks, style="yellow", markup=False)
 
