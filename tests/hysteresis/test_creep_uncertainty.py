@@ -61,6 +61,17 @@ def test_maps_that_all_actuators_err_in_together_count_for_less() -> None:
     assert (sigma > 1.1 * usual).all()
 
 
+def test_maps_that_are_followed_more_closely_than_others_are_predicted_count_for_less() -> None:
+    run = run_of(CREEPS, 300)
+    held_out = np.full_like(run.responses.values, np.nan)
+    held_out[::10] = 6e-10 * np.random.default_rng(4).standard_normal(held_out[::10].shape)
+    seconds = (CREEP_TIMES > 0.5) & (CREEP_TIMES < 30.0)
+    for usual, wider in zip(creep_covariance(run, CREEPS), creep_covariance(run, CREEPS, held_out), strict=True):
+        assert (relative(wider)[seconds] > 1.2 * relative(usual)[seconds]).all()
+    as_well = creep_covariance(run, CREEPS, np.where(np.isfinite(held_out), 1e-10, np.nan))
+    np.testing.assert_array_equal(as_well, creep_covariance(run, CREEPS))
+
+
 @pytest.mark.parametrize("dead", [1, 4])
 def test_a_dead_actuator_is_known_no_better_than_before_the_run(dead: int) -> None:
     alive = np.ones(COUNT)
@@ -101,6 +112,20 @@ def test_a_run_is_as_sure_of_creep_as_it_may_be() -> None:
 
 def creep_error(law: HysteresisModel, shown: CreepShown | None = None) -> CreepError:
     return CreepError(law, RESPONSE, 1e-6 * np.eye(COUNT), np.full(COUNT, 0.8), shown)
+
+
+@pytest.mark.parametrize("age", [10.0, 1000.0])
+def test_a_held_shape_stays_inside_its_bound(age: float) -> None:
+    """Weights of slow elements err as the covariance says; the hold corrects by those of the law."""
+    covariance = creep_covariance(run_of(CREEPS, 150), CREEPS)
+    slow = np.concatenate(([False], CREEP_TIMES > 100.0))
+    covariance *= np.outer(slow, slow)
+    law, position = replace(CREEPS, creep_covariance=covariance), np.linspace(-0.5, 0.5, COUNT)
+    bound = creep_error(law).bound(law.demagnetised(COUNT, 0.0), position, 0.05).max_zernike
+    rng, followed = np.random.default_rng(6), np.concatenate(([1.0], 1.0 - np.exp(-age / CREEP_TIMES)))
+    shared, each = (rng.multivariate_normal(0.0 * followed, one, (500, COUNT)) @ followed for one in covariance)
+    errors = np.abs(((shared[:, :1] + each) * position) @ RESPONSE.T).max(axis=1)
+    assert np.mean(errors < bound) >= 0.95
 
 
 def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
@@ -167,7 +192,7 @@ def test_what_was_held_before_a_calibration_is_in_doubt_while_it_fades() -> None
     assert 0.85 < np.mean(np.abs(others).max(axis=1) < hours[-1]) < 1.0
     # A recipe measured meanwhile shows what was left then.
     built = [error.bound(law.advance(state, 11800.0), rest, 0.05, at).max_zernike for at in (0.0, 4600.0, 11800.0)]
-    assert built[0] == pytest.approx(hours[-1]) and 0.0 < built[1] < 0.7 * built[0] and built[2] < 0.01 * built[0]
+    assert built[0] == pytest.approx(hours[-1]) and 0.0 < built[1] < 0.7 * built[0] and built[2] < 0.03 * built[0]
 
 
 def test_a_recipe_includes_the_old_creep_of_when_it_was_measured() -> None:
@@ -182,7 +207,7 @@ def test_a_recipe_includes_the_old_creep_of_when_it_was_measured() -> None:
         [error.bound(law.advance(state, time), rest, 0.05, measured).max_zernike for time in times]
         for measured in (None, 3000.0, 0.0)
     )
-    assert built[0] == sorted(built[0]) and built[0][1] < 0.2 * direct[1] < 0.2 * direct[2] < built[0][2]
+    assert built[0] == sorted(built[0]) and built[0][1] < 0.3 * direct[1] < 0.3 * direct[2] < built[0][2]
     assert built[1] == pytest.approx(direct, rel=0.05)  # one that was measured in the run
     # Later maps shift a recipe that was built before them as they shift the figure.
     now = law.advance(state, times[-1])

@@ -4,7 +4,9 @@ Creep much faster than a map, or much slower than the run, is known from the smo
 between, from the maps. To first order the errors of the weights are those of a Bayesian linear regression on positions
 and states of the creep elements, with figure and gains as fitted. Effects outside the law, such as loops that widen
 with speed, are common to all actuators, so the errors of the responses are not independent: the maps count for less, by
-the ratio in which their residual exceeds independent errors along the features.
+the ratio in which their residual exceeds independent errors along the features. Laws of each actuator follow the maps
+of a short run more closely than they predict others, so the maps count for less, too, by the ratio in which the
+residual of maps held out exceeds that of the fit.
 """
 
 from dataclasses import replace
@@ -29,10 +31,13 @@ POSITION, OWN_POSITION = 0.03, 0.009
 DEAD = 0.01
 
 
-def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
+def creep_covariance(run: Run, law: HysteresisModel, held_out: Floats | None = None) -> Floats:
     """(2, 1 + J, 1 + J) covariances of the weights of position and creep elements after the fit to `run`.
 
     The first is of errors that all actuators share, the second of those of each by itself (mean over the actuators).
+
+    Args:
+        held_out: (M, D) m, residual of maps that had no part in a fit, NaN for the others; None = all had.
     """
     keep = run.responses.usable
     position, effective = run.follow(replace(law, creep_rate=0.0)), run.follow(law)
@@ -48,8 +53,10 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     evidence = np.einsum("mjd,mkd->jk", together, together)
     errors = np.einsum("mjd,md->mj", together, left / scatter)
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
+    unseen = np.square((left if held_out is None else held_out[np.isfinite(held_out).all(axis=1)]) / scatter)
+    beyond = max(1.0, float(unseen.mean())) if unseen.size else 1.0
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
-    shared = _posterior(evidence / excess, prior)
+    shared = _posterior(evidence / (excess * beyond), prior)
     # Evidence on one actuator while all others are free; a dead one has none. Left out are the three signal patterns
     # that make piston and tilt, which no response contains. A dead actuator is such a hidden pattern by itself; without
     # it the others cannot form one of the three. A mirror of three actuators or fewer has no such patterns.
@@ -61,7 +68,7 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     weight[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)
     prior = _prior(law, OWN, OWN_CORRELATION, OWN_POSITION)
     each = np.einsum("mjn,mkn,n->njk", seen, seen, weight, optimize=True)
-    return np.stack((shared, _posterior(each, prior).mean(axis=0)))
+    return np.stack((shared, _posterior(each / beyond, prior).mean(axis=0)))
 
 
 def _posterior(evidence: Floats, prior: Floats) -> Floats:

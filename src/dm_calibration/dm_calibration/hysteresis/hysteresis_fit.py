@@ -95,7 +95,7 @@ def fit_hysteresis(
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
     law = _followed(maps, found.fit.law, run)[1]
     if law.creep_rate:
-        law = replace(law, creep_covariance=creep_covariance(run, law))
+        law = replace(law, creep_covariance=creep_covariance(run, law, found.held_out))
     remarks = [*_remarks(found), *_left_out(maps, run), *_drifted(law)]
     if not maps.degaussed.any():
         remarks.append(NO_DEGAUSS)

@@ -9,7 +9,7 @@ from dm_common.hysteresis.creep_record import SLOW_S
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 #: Ages of a shape, s, for which a bound holds, besides the moment when it is to be right.
-AGES = (1.0, 10.0, 100.0)
+AGES = (1.0, 10.0, 100.0, 1000.0)
 #: The calibration's figure includes the creep left at this time after `crept_at`, s: half of a typical run.
 IN_FIGURE_S = 200.0
 #: Ages at which recipes are measured, s.
