@@ -426,6 +426,33 @@ def test_a_controller_that_is_found_late_is_waited_for(monkeypatch: pytest.Monke
     assert said.exit_code == 0 and "promised 30 nm (95 % bound), measured 20 nm: inside" in said.output
 
 
+@pytest.mark.parametrize(("flat", "promised"), [(9e-9, 6), (4e-9, 3), (None, 3)])
+def test_after_a_degauss_a_map_is_held_against_a_bound_that_includes_creep(
+    monkeypatch: pytest.MonkeyPatch, flat: float | None, promised: int
+) -> None:
+    """What was held before creeps on, and the bound of the calibration holds no creep."""
+
+    def flatten(dry_run: bool) -> FocusState:
+        assert dry_run
+        if flat is None:
+            raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, "beyond the range")
+        return FocusState(predicted_max_zernike=3e-9, predicted_max_zernike_upper=flat)
+
+    client = SimpleNamespace(
+        flatten=flatten,
+        update_calibration=lambda **_options: UpdateCalibration.Response(accepted=True, max_zernike=5e-9),
+        latest=lambda _name: Calibration(id="c1"),
+        messages={"capabilities": Capabilities(error_bound=3e-9)},
+        wait=lambda _condition, _timeout_s: True,
+    )
+    monkeypatch.setattr(check, "running_suite", lambda _namespace: nullcontext(client))
+    monkeypatch.setattr(check, "nodes_of_suite", lambda _client: {"focus_controller": 1})
+    monkeypatch.setattr(check, "receive_health", lambda _client: {"focus_controller": SimpleNamespace(values=[])})
+    said = CliRunner().invoke(cli.make_app(), ["check"])
+    assert f"promised {promised} nm (95 % bound), measured 5 nm" in said.output
+    assert said.exit_code == (0 if promised > 5 else 1)
+
+
 def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:
     older, newer = tmp_path / "a", tmp_path / "b"
     assert folder_with("", (older, newer)) == older

@@ -1,6 +1,6 @@
 """`dm check`: compare one map with the calibration in use, and let it improve it."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -55,10 +55,12 @@ def check(
         # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
         # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
         # another surface than the model predicts, so for a conditioned shape the model's bound counts where it is
-        # larger: it holds no creep.
+        # larger: it holds no creep. A shape that nobody requested, as after a degauss, has no bound of its own; that of
+        # the flat mirror includes the creep of what was held before.
         if not client.wait(heard, REPORT_S) and nodes_of_suite(client)["focus_controller"]:  # not found at first
             client.wait(heard, BUSY_S - REPORT_S)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
+        flat = _flat_bound(client) if shape is None and capabilities is not None else 0.0
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
     # The map is compared by the history known to the node `calibration`, which may have run for longer.
@@ -66,7 +68,7 @@ def check(
     if lost or capabilities is None:  # what a focus controller with that node's knowledge would promise
         promised = promise_of(calibration)
     elif shape is None:
-        promised = capabilities.error_bound
+        promised = max(capabilities.error_bound, flat)
     else:
         promised = max(shape.bound - shape.predicted, capabilities.error_bound if shape.conditioned else 0.0)
     if forget:
@@ -111,3 +113,14 @@ def check(
     next_step(then, namespace)
     if failed or outside:
         raise typer.Exit(1)
+
+
+def _flat_bound(client: Any) -> float:
+    """Bound of a request for the flat mirror at this moment beyond its prediction, m; 0 = there is none."""
+    from dm_client import DeformableMirrorError
+
+    try:
+        state = client.flatten(dry_run=True)
+    except DeformableMirrorError:  # not within reach
+        return 0.0
+    return float(state.predicted_max_zernike_upper - state.predicted_max_zernike)
