@@ -84,9 +84,9 @@ PLAIN = frozenset(
     re.findall(
         r"\w+",
         "accurate active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
-        "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min most needs newest none now "
-        "present again doctor have long ok own pdf ready real running said several sheets since soon start status "
-        "taken terminal config there things took typical "
+        "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min most needs newest "
+        "none now present again doctor have long ok own pdf ready real running said several sheets since soon start "
+        "status taken terminal config there things took typical "
         "other valid whole write writes written yaml yet",
     )
 )

@@ -288,8 +288,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
     config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
-    # 200 of 37 actuators: from fewer, slow creep is off where a busy machine delays the commands of a bench in fast time.
-    # `./dm report` writes the report.
+    # 200 of 37 actuators: from fewer, slow creep is off where a busy machine delays the commands of a bench in fast
+    # time. `./dm report` writes the report.
     config["calibration"] |= {"hysteresis_maps": 200, "write_report": False}
     home.mkdir()
     save_config(config, folder / "my_bench.yaml")
