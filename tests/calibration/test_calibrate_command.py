@@ -106,7 +106,7 @@ def test_a_poke_check_that_no_parameter_puts_right_says_so_once_and_what_becomes
     assert "found.yaml is not written" in said.output.replace("\n", "") and not target.exists()
     assert "correct" not in said.output  # nobody knows that of a check that failed
     assert all(said.output.count(finding) == 1 for finding in findings)
-    assert str(said.exception) == "resumed run r with 9 maps; see above; the mirror is not at rest"
+    assert str(said.exception) == "resumed run r with 9 maps; see the findings above; the mirror is not at rest"
     assert said.exit_code == 1
 
 

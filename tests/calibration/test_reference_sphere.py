@@ -53,12 +53,16 @@ def test_the_map_of_a_sphere_is_published_to_nobody(sphere: bool, monkeypatch: p
     assert calls == [sphere]
 
 
-@pytest.mark.parametrize(("in_use", "then"), [("c1", "./dm check compares"), ("", "./dm calibrate\n")])
-def test_the_next_step_is_one_that_will_not_be_refused(in_use: str, then: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("in_use", "then"), [("c1", "./dm check compares"), ("", "./dm status"), (None, "./dm status")]
+)
+def test_the_next_step_is_one_that_will_not_be_refused(
+    in_use: str | None, then: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taken = Measure.Response(info=SurfaceMapInfo(), zernike=ZernikeCoefficients(coefficients=[0.0] * len(SPOKEN)))
     client = SimpleNamespace(
         measure=lambda label, answer_only: taken,
-        messages={"calibration": Calibration(id=in_use)},
+        messages={} if in_use is None else {"calibration": Calibration(id=in_use)},
         wait=lambda condition, timeout_s: bool(condition()),
     )
     monkeypatch.setattr(measure, "running_suite", lambda namespace: nullcontext(client))

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Union, get_origin, get_type_hints
 
 import pytest
 import typer
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from dm_msgs.srv import SetFocus, UpdateCalibration
 from typer.testing import CliRunner
 
@@ -432,14 +432,14 @@ def test_after_a_degauss_a_map_is_held_against_a_bound_that_includes_creep(
 ) -> None:
     """What was held before creeps on, and the bound of the calibration holds no creep."""
 
-    def flatten(dry_run: bool) -> FocusState:
-        assert dry_run
+    def focus(curvature: float, dry_run: bool, mode: int) -> FocusState:
+        assert dry_run and (curvature, mode) == (0.0, FocusRequest.MODE_DIRECT)
         if flat is None:
             raise DeformableMirrorError(ErrorCode.OUT_OF_RANGE, "beyond the range")
         return FocusState(predicted_max_zernike=3e-9, predicted_max_zernike_upper=flat)
 
     client = SimpleNamespace(
-        flatten=flatten,
+        focus=focus,
         update_calibration=lambda **_options: UpdateCalibration.Response(accepted=True, max_zernike=5e-9),
         latest=lambda _name: Calibration(id="c1"),
         messages={"capabilities": Capabilities(error_bound=3e-9)},

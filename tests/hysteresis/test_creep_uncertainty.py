@@ -123,7 +123,9 @@ def test_a_held_shape_stays_inside_its_bound(age: float) -> None:
     law, position = replace(CREEPS, creep_covariance=covariance), np.linspace(-0.5, 0.5, COUNT)
     bound = creep_error(law).bound(law.demagnetised(COUNT, 0.0), position, 0.05).max_zernike
     rng, followed = np.random.default_rng(6), np.concatenate(([1.0], 1.0 - np.exp(-age / CREEP_TIMES)))
-    shared, each = (rng.multivariate_normal(0.0 * followed, one, (500, COUNT)) @ followed for one in covariance)
+    shared, each = (
+        rng.multivariate_normal(np.zeros(len(followed)), one, (500, COUNT)) @ followed for one in covariance
+    )
     errors = np.abs(((shared[:, :1] + each) * position) @ RESPONSE.T).max(axis=1)
     assert np.mean(errors < bound) >= 0.95
 
@@ -190,7 +192,7 @@ def test_what_was_held_before_a_calibration_is_in_doubt_while_it_fades() -> None
     size = 0.5 * np.sqrt(np.mean(np.square(law.crept)))
     others = size * rng.standard_normal((400, COUNT)) @ RESPONSE.T * (law.creep_share @ faded)
     assert 0.85 < np.mean(np.abs(others).max(axis=1) < hours[-1]) < 1.0
-    # A recipe measured meanwhile shows what was left then.
+    # A recipe measured meanwhile shows what was left then; what fades in the 1000 s of its bound remains.
     built = [error.bound(law.advance(state, 11800.0), rest, 0.05, at).max_zernike for at in (0.0, 4600.0, 11800.0)]
     assert built[0] == pytest.approx(hours[-1]) and 0.0 < built[1] < 0.7 * built[0] and built[2] < 0.03 * built[0]
 

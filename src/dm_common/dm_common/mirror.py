@@ -139,6 +139,6 @@ class Applied:
 def counts_anew(report: Any, last: Any) -> bool:
     """Whether the driver was activated anew between the reports `last` and `report`, Applied or dm_msgs/ActuatorState.
 
-    It may be heard only once one of its counts has passed that of before.
+    Any of its counts shows it: a report may come only after the others have passed their values of before.
     """
     return any(getattr(report, name) < getattr(last, name) for name in ("sequence", "turns", "degausses"))

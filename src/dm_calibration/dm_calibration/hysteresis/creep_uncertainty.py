@@ -37,7 +37,7 @@ def creep_covariance(run: Run, law: HysteresisModel, held_out: Floats | None = N
     The first is of errors that all actuators share, the second of those of each by itself (mean over the actuators).
 
     Args:
-        held_out: (M, D) m, residual of maps that had no part in a fit, NaN for the others; None = all had.
+        held_out: (M, D) m, residual of maps that had no part in a fit, NaN for the others; None = every map was fitted.
     """
     keep = run.responses.usable
     position, effective = run.follow(replace(law, creep_rate=0.0)), run.follow(law)
@@ -53,8 +53,8 @@ def creep_covariance(run: Run, law: HysteresisModel, held_out: Floats | None = N
     evidence = np.einsum("mjd,mkd->jk", together, together)
     errors = np.einsum("mjd,md->mj", together, left / scatter)
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
-    unseen = np.square((left if held_out is None else held_out[np.isfinite(held_out).all(axis=1)]) / scatter)
-    beyond = max(1.0, float(unseen.mean())) if unseen.size else 1.0
+    unseen = (left if held_out is None else held_out[np.isfinite(held_out).all(axis=1)]) / scatter
+    beyond = max(1.0, float(np.median(np.square(unseen).mean(axis=1)))) if len(unseen) else 1.0  # of a typical map
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
     shared = _posterior(evidence / (excess * beyond), prior)
     # Evidence on one actuator while all others are free; a dead one has none. Left out are the three signal patterns

@@ -83,7 +83,7 @@ class Move:
 
     @cached_property
     def drift(self) -> tuple[float, float]:
-        """m, what creep adds to the largest coefficient error and to the rms within 100 s where nothing corrects it."""
+        """m, what creep adds to the largest coefficient error and to the rms within 1000 s if nothing corrects it."""
         return self._drift()
 
 

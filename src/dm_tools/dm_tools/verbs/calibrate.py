@@ -128,7 +128,7 @@ def show_result(result: Any, calibration: Any = None) -> None:
 def unlisted(result: Any) -> str:
     """The message of a failed result, without the findings that `show_result` lists."""
     listed = [entry for entry in result.poke_findings if entry in result.message]
-    return str(result.message.replace("; ".join(listed), "see above") if listed else result.message)
+    return str(result.message.replace("; ".join(listed), "see the findings above") if listed else result.message)
 
 
 def after_run(result: Any, written: Path | None, used: bool = True) -> str:

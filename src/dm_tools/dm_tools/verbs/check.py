@@ -55,16 +55,17 @@ def check(
         # The promise that counts is the bound of the present shape, not that of any shape, as it was before the map,
         # which may widen it. Its predicted part is subtracted: the map is compared with the prediction. A recipe makes
         # another surface than the model predicts, so for a conditioned shape the model's bound counts where it is
-        # larger: it holds no creep. A shape that nobody requested, as after a degauss, has no bound of its own; that of
-        # the flat mirror includes the creep of what was held before.
+        # larger: it holds no creep. A shape that was not requested, as after a degauss, has no bound of its own; that
+        # of a flat mirror includes the creep which shapes held before have left.
         if not client.wait(heard, REPORT_S) and nodes_of_suite(client)["focus_controller"]:  # not found at first
             client.wait(heard, BUSY_S - REPORT_S)
         shape, capabilities = settled_shape(health), client.messages.get("capabilities")
-        flat = _flat_bound(client) if shape is None and capabilities is not None else 0.0
+        # The map is compared by the history known to the node `calibration`, which may have run for longer.
+        lost = unknown_history(capabilities)
+        unasked = not (forget or lost) and shape is None and capabilities is not None
+        flat = _flat_bound(client) if unasked else 0.0
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
-    # The map is compared by the history known to the node `calibration`, which may have run for longer.
-    lost = unknown_history(capabilities)
     if lost or capabilities is None:  # what a focus controller with that node's knowledge would promise
         promised = promise_of(calibration)
     elif shape is None:
@@ -117,10 +118,12 @@ def check(
 
 def _flat_bound(client: Any) -> float:
     """Bound of a request for the flat mirror at this moment beyond its prediction, m; 0 = there is none."""
+    from dm_msgs.msg import FocusRequest
+
     from dm_client import DeformableMirrorError
 
     try:
-        state = client.flatten(dry_run=True)
+        state = client.focus(0.0, dry_run=True, mode=FocusRequest.MODE_DIRECT)  # by the model, as the map is predicted
     except DeformableMirrorError:  # not within reach
         return 0.0
     return float(state.predicted_max_zernike_upper - state.predicted_max_zernike)

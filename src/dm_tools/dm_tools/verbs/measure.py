@@ -29,7 +29,7 @@ def measure(
         raise typer.BadParameter(f"--reference-sphere {reference_sphere:g}: must be a radius in m other than 0")
     with running_suite(namespace) as client:
         answer = client.measure(label, answer_only=reference_sphere is not None)
-        calibration = latest_message(client, "calibration", REPORT_S)
+        calibration = latest_message(client, "calibration", REPORT_S) if reference_sphere is None else None
     info, coefficients = answer.info, list(answer.zernike.coefficients)
     radius = info.aperture_radius
     found: dict[str, Any] = {
@@ -50,7 +50,7 @@ def measure(
         console.print(f"defocus: that of a surface with the curvature {round(found['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}")
     in_use = calibration is not None and calibration.id
-    then = "./dm check compares a map with the calibration in use" if in_use else "./dm calibrate"
+    then = f"./dm {'check compares a map with the calibration in use' if in_use else 'status says what to do next'}"
     if reference_sphere is not None:
         found["pitch"] = _scale(info, coefficients, reference_sphere)
         then = "put the parameters into the parameter file; then take the sphere out"
