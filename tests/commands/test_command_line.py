@@ -606,14 +606,15 @@ def test_status_says_where_only_of_what_is_absolute() -> None:
 
 def test_a_node_that_was_not_heard_does_not_count_as_well() -> None:
     well = SimpleNamespace(level=b"\0", message="ready")
-    doubtful = SimpleNamespace(level=b"\1", message="calibrate again")
+    doubtful = SimpleNamespace(level=b"\1", message="./dm calibrate")
     health = dict.fromkeys(("pdm_driver", "interferometer", "focus_controller"), well)
     found = Counter((*health, "calibration"))
     silent = verb_status._silent(found, health)
     assert verb_status._health(health, silent) == "calibration: not heard"
     assert not verb_status._silent(Counter(health), health), "a node that does not run is in another row"
     assert verb_status._health(health, []) == "ok"
-    assert verb_status._health(health | {"calibration": doubtful}, []) == "calibration: calibrate again"
+    said = verb_status._health(health | {"calibration": doubtful}, [], "b")
+    assert said == "calibration: ./dm calibrate --namespace b"
 
 
 def test_status_knows_no_negative_zero() -> None:

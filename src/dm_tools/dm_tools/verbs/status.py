@@ -56,7 +56,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "calibration": _calibration(latest, times[-1] if times else time.time()),
         "promise": _promise(capabilities),
         "absolute": _absolute(capabilities, calibration),
-        "health": _health(health, _silent(found, health)),
+        "health": _health(health, _silent(found, health), namespace),
         "next": in_namespace(
             _next(lacking, by, state, calibration, shape, capabilities, "virtual_bench" in found), namespace
         ),
@@ -80,13 +80,14 @@ def _silent(found: Mapping[str, int], health: dict[str, Any]) -> list[str]:
     return [name for name in NEEDED if found[name] and name not in health]
 
 
-def _health(health: dict[str, Any], silent: list[str]) -> str:
+def _health(health: dict[str, Any], silent: list[str], namespace: str = "") -> str:
     """Health messages of the nodes that are not well, each sentence once; `silent` nodes have not said how they are."""
     said: dict[str, list[str]] = {"not heard": silent} if silent else {}
     for name, each in health.items():
         if each.level != b"\0":
             said.setdefault(each.message, []).append(name)
-    return "; ".join(f"{', '.join(names)}: {message}" for message, names in said.items()) or "ok"
+    texts = (f"{', '.join(names)}: {in_namespace(message, namespace)}" for message, names in said.items())
+    return "; ".join(texts) or "ok"
 
 
 def _now(by: str, shape: SettledShape | None, state: Any) -> str:
