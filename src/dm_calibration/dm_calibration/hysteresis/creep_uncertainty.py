@@ -53,8 +53,9 @@ def creep_covariance(run: Run, law: HysteresisModel, held_out: Floats | None = N
     evidence = np.einsum("mjd,mkd->jk", together, together)
     errors = np.einsum("mjd,md->mj", together, left / scatter)
     excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
-    unseen = (left if held_out is None else held_out[np.isfinite(held_out).all(axis=1)]) / scatter
-    beyond = max(1.0, float(np.median(np.square(unseen).mean(axis=1)))) if len(unseen) else 1.0  # of a typical map
+    beyond = 1.0
+    if held_out is not None and len(unseen := held_out[np.isfinite(held_out).all(axis=1)]):
+        beyond = max(beyond, float(np.median(np.square(unseen / scatter).mean(axis=1))))  # of a typical map
     prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
     shared = _posterior(evidence / (excess * beyond), prior)
     # Evidence on one actuator while all others are free; a dead one has none. Left out are the three signal patterns
